@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +25,8 @@ PIXELS = 256
 ITERATIONS = 100
 #: Vertices of the face per cell of the initial face, along each side, and the maximum along one side.
 FINER, MOST_VERTICES = 3, 1024
+#: Stages until a face is found, about: trials of the floor, grids, the solid.
+STAGES = 9
 #: Options whose names differ from those of the face's settings.
 _OPTIONS = {"picture_size": "--picture-size", "light_distance": "--light-distance", "incidence": "--mirror"}
 
@@ -87,10 +93,58 @@ class LensOptions:
             raise ConfigError("--sun", "", "needs parallel light, --light-distance a point light; remove one")
         if self.output.exists() and not self.output.is_dir():
             raise ConfigError("--output", "", f"{self.output} is a file; name a folder")
-        names = ("lens.yaml", "scene.xml", "face.ply", "target.exr", "picture.exr", "start.exr")
+        names = ("lens.yaml", "scene.xml", "face.ply", "target.exr", "picture.exr", "start.exr", "preview.png")
         taken = next((path for name in names if (path := self.output / name).exists()), None)
         if taken is not None:
             raise ConfigError("--output", "", f"{taken} exists; give another folder, or remove it")
+
+
+def similarity(image: np.ndarray, picture: np.ndarray) -> str:
+    """Return the SSIM of two images in words, as in fabrication.json. The text is empty for images that
+    are smaller than the window of SSIM.
+    """
+    from skimage.metrics import structural_similarity
+
+    if min(picture.shape) < 7:
+        return ""
+    seen, wanted = image / image.mean(), picture / picture.mean()
+    value = float(structural_similarity(seen, wanted, data_range=float(wanted.max())))
+    return f"; SSIM with the picture {value:.2f}"
+
+
+#: Seconds from the start, and from line to line, without a terminal.
+SECONDS_PER_LINE = 5.0
+
+
+@contextmanager
+def show_stages(count: int) -> Iterator[Callable[[str], None]]:
+    """Show on standard error which of about `count` stages runs: by a bar on a terminal, otherwise by lines. Yields a
+    function that takes the name of the stage that begins.
+    """
+    stream, begun, last = sys.stderr, 0, time.monotonic()
+    bar: Any = None
+    if stream is not None and stream.isatty():
+        from tqdm import tqdm
+
+        form = "{percentage:3.0f}%|{bar}| {desc}, {elapsed}"
+        bar = tqdm(total=count, file=stream, leave=False, dynamic_ncols=True, bar_format=form)
+
+    def tell(stage: str) -> None:
+        nonlocal begun, last
+        begun += 1
+        if bar is not None:
+            bar.set_description_str(stage, refresh=False)
+            bar.update(min(1, begun - 1, count - bar.n))
+            bar.refresh()
+        elif stream is not None and time.monotonic() - last > SECONDS_PER_LINE:
+            last = time.monotonic()
+            click.echo(f"{stage} ...", file=stream)
+
+    try:
+        yield tell
+    finally:
+        if bar is not None:
+            bar.close()
 
 
 @click.command("lens")
@@ -131,13 +185,14 @@ class LensOptions:
     help="Minimum brightness, as a fraction of the maximum, to which darker parts are raised. Default: chosen.",
 )
 @click.option("--pixels", type=click.IntRange(16, 1024), default=PIXELS, show_default=True,
-              help="Pixels of the picture's longer side, and texels of the face's longer side.")  # fmt: skip
+              help="Pixels of the picture's longer side. The face has three vertices per pixel along each side, but at "
+                   "most 1024 along its longer side.")  # fmt: skip
 def command(**given: Any) -> None:
     """Write an experiment that shapes a lens, or a mirror, whose caustic shows PICTURE in parallel light.
 
-    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face of the lens or mirror already casts the picture.
-    Before any rendering, the command prints the depth of the face's relief. At twice the distance, the relief is about
-    half as deep.
+    Run it with `reslrb optimize FOLDER/lens.yaml`. The initial face of the lens or mirror already casts the picture:
+    `preview.png` shows the caustic that it is computed to cast. The command prints the depth of the relief, the size of
+    the solid and the cutter that fits into it. At twice the distance, the relief is about half as deep.
     """
     import numpy as np
 
@@ -179,20 +234,27 @@ def command(**given: Any) -> None:
         tilt=options.tilt,
         incidence=options.mirror or 0.0,
     )
+    finer = min(FINER, max(1, MOST_VERTICES // pixels))
     try:
-        surface = shape_surface(image, setting, pixels, "auto" if options.floor is None else options.floor)
+        with show_stages(STAGES) as tell:
+            surface = shape_surface(image, setting, pixels, "auto" if options.floor is None else options.floor, tell)
+            tell("solid")
+            ny, nx = (finer * cells for cells in surface.heights.shape)
+            heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)
+            solid = experiment.solid_lines(setting, heights)
     except ConfigError as error:
-        key = error.key
+        key = error.key.removeprefix("fabrication.")
         source = picture if key == "picture" else _OPTIONS.get(key, f"--{key}")
         raise ConfigError(source, "", error.message) from None
     echo(surface.summary())
     target, power = experiment.target_image(image, surface)
     film = target.shape[1], target.shape[0]
+    preview, original = surface.forecast, resized(image, surface.forecast.shape)
+    # Brighter spots than the brightest part of the picture are white.
+    shown = preview * (original.mean() / original.max())
     with writing("--output", output):
         output.mkdir(parents=True, exist_ok=True)
-        finer = min(FINER, max(1, MOST_VERTICES // pixels))
-        ny, nx = (finer * cells for cells in surface.heights.shape)
-        heights = experiment.at_vertices(surface, nx, ny).astype(np.float32)
+        write_file(output / "preview.png", shown.astype(np.float32)[:, :, None], linear=False)
         write_file(output / "start.exr", heights[:, :, None], linear=True)
         for name, seen in (("target.exr", target), ("picture.exr", experiment.on_film(image))):
             write_file(output / name, np.repeat(seen.astype(np.float32)[:, :, None], 3, 2), linear=True)
@@ -203,5 +265,8 @@ def command(**given: Any) -> None:
         }
         for name, content in texts.items():
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
+    for line in solid:
+        echo(line)
+    echo(f"{output / 'preview.png'}: the caustic at the start{similarity(preview, original)}")
     echo(f"{output / 'lens.yaml'}: {nx}x{ny} heights, a picture of {columns}x{rows} pixels")
     echo(f"next: `reslrb optimize {output / 'lens.yaml'}`")

@@ -18,8 +18,9 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
+from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens import transport
-from reslrb_cli.lens.solid import ply_file
+from reslrb_cli.lens.solid import as_sheet, make_solid, measured, ply_file, summary
 from reslrb_cli.lens.surface import Array, Rays, Setting, Surface, transmitted
 
 #: Reflectance of the receiver, and its width in widths of the picture.
@@ -87,11 +88,26 @@ def face_ply(setting: Setting, nx: int, ny: int) -> bytes:
     u, v = np.meshgrid((np.arange(nx) + 0.5) / nx, (np.arange(ny) + 0.5) / ny)
     zero = np.zeros_like(x)
     points = np.stack([x, y, zero, zero, zero, zero + 1.0, u, v], axis=-1).reshape(-1, 8)
+    return ply_file(points, _triangles(nx, ny))
+
+
+def _triangles(nx: int, ny: int) -> NDArray[np.int64]:
+    """Return the triangles (n, 3) of the face, counterclockwise as seen from +z."""
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
-    cells = np.concatenate([
+    return np.concatenate([
         np.stack([corner, corner + 1, corner + nx + 1], 1), np.stack([corner, corner + nx + 1, corner + nx], 1)
     ])  # fmt: skip
-    return ply_file(points, cells)
+
+
+def solid_lines(setting: Setting, heights: NDArray[Any]) -> list[str]:
+    """Return lines about the solid of a face with `heights` (ny, nx) at its vertices. Raises ConfigError if its front
+    and back cross.
+    """
+    ny, nx = heights.shape
+    points = np.stack([*vertices(setting, nx, ny), heights], axis=-1).reshape(-1, 3)
+    plan = Fabrication(kind=setting.kind, thickness=setting.thickness, outline=setting.outline)
+    sheet = as_sheet(plan.face, points, _triangles(nx, ny))
+    return summary(measured(make_solid(sheet, plan), sheet, plan))
 
 
 def target_image(picture: Array, surface: Surface) -> tuple[Array, float]:

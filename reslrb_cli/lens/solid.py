@@ -145,6 +145,11 @@ def make_solid(sheet: Sheet, plan: Fabrication) -> Solid:
     if max(map(abs, middle)) > _SIZE * max(sheet.half):
         raise ConfigError("", "fabrication.face", f"the centre of `{sheet.name}` is at x = {middle[0]:.3g}, y = "
                                                   f"{middle[1]:.3g}; it must be at 0")  # fmt: skip
+    low, high = float(sheet.z.min()), float(sheet.z.max())
+    beyond = (high - low) + _SIZE * max(sheet.half)
+    if low > beyond or high < -beyond:
+        raise ConfigError("", "fabrication.face", f"`{sheet.name}` is at z = {low:.4g} to {high:.4g}; it must be about "
+                                                  "z = 0, because the thickness starts there")  # fmt: skip
     thin = least_thickness(sheet, plan)
     if thin <= 0:
         raise ConfigError("", "fabrication.thickness", f"{plan.thickness:g} mm: front and back overlap by {-thin:.3g} "
@@ -401,7 +406,9 @@ def summary(numbers: dict[str, Any]) -> list[str]:
     for name, face in numbers["faces"].items():
         radius, slope = face["smallest_concave_radius"], face["steepest_slope_degrees"]
         hollow = "nowhere hollow" if radius is None else f"hollows with radii from {radius:.3g} mm"
-        lines.append(f"{name}: {face['relief']:.3g} mm deep, slopes up to {slope:.3g} degrees, {hollow}")
+        ball = face["cutter"]["largest_radius"]
+        fits = "any ball cutter" if ball is None else f"ball cutter with a radius up to {ball:.3g} mm"
+        lines.append(f"{name}: {face['relief']:.3g} mm deep, slopes up to {slope:.3g} degrees, {hollow}; {fits}")
     return lines + numbers["warnings"]
 
 

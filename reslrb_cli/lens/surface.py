@@ -14,6 +14,7 @@ always possible.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -71,6 +72,13 @@ class Surface:
     floor: float
     relief: float
     transport: transport.Transport
+
+    @property
+    def forecast(self) -> Array:
+        """The caustic (rows, columns) with mean 1 according to the transport, as a picture with row 0 at the top. It
+        has as many pixels as the picture, or as the grid if that is coarser.
+        """
+        return self.transport.pushed[::-1, ::-1]
 
     def summary(self) -> str:
         """Return depth, floor and errors in one line."""
@@ -184,12 +192,16 @@ def within(setting: Setting, x: Array, y: Array) -> NDArray[np.bool_]:
 
 
 def shape_surface(
-    picture: Array, setting: Setting, cells: int = 256, floor: float | Literal["auto"] = "auto"
+    picture: Array,
+    setting: Setting,
+    cells: int = 256,
+    floor: float | Literal["auto"] = "auto",
+    tell: Callable[[str], None] = lambda stage: None,
 ) -> Surface:
     """Return the face whose caustic shows `picture` (rows, columns), a luminance with row 0 at the top.
 
-    The grid has `cells` along its longer side. Raises ConfigError if no face can show the picture. The error names the
-    setting and a remedy.
+    The grid has `cells` along its longer side. `tell` receives the name of each stage. Raises ConfigError if no face
+    can show the picture. The error names the setting and a remedy.
     """
     _check(picture, setting)
     rays = Rays(setting)
@@ -198,7 +210,7 @@ def shape_surface(
     start, chosen = _start(rays), floor == "auto"
     if floor == "auto":
         with np.errstate(invalid="ignore", divide="ignore"):  # of trials that send no light
-            found = transport.least_floor(rays, target, setting.size, setting.picture_size, start)
+            found = transport.least_floor(rays, target, setting.size, setting.picture_size, start, tell)
         if found is None:
             near = "a more distant light, " if np.isfinite(setting.light_distance) else ""
             raise ConfigError("", "picture", f"has too much contrast for this {setting.kind}: even with a floor of "
@@ -210,7 +222,7 @@ def shape_surface(
 
     def solved(floor: float) -> transport.Transport:
         lifted = transport.lifted(target, floor)
-        return transport.solve(rays, lifted, setting.size, setting.picture_size, shape, start)
+        return transport.solve(rays, lifted, setting.size, setting.picture_size, shape, start, tell)
 
     made = solved(floor)
     if chosen and floor < transport.FOR_LINES and made.residual > transport.UNSOLVED:
@@ -223,9 +235,10 @@ def shape_surface(
     inside = within(setting, *transport.grid(shape, setting.size))
     low, high = float(made.h[inside].min()), float(made.h[inside].max())
     relief = high - low
-    if setting.kind == "lens" and setting.thickness + low <= 0:
+    if setting.thickness + low <= 0:
+        into = "the glass" if setting.kind == "lens" else "the mirror"
         reason = (
-            f"the relief is {relief:.3g} mm deep and goes {-low:.3g} mm into the glass; thickness must be above "
+            f"the relief is {relief:.3g} mm deep and goes {-low:.3g} mm into {into}; thickness must be above "
             f"{-low:.3g} mm, or distance larger (the relief is about half as deep at twice the distance)"
         )
         raise ConfigError("", "thickness", reason)

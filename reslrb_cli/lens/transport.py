@@ -15,6 +15,7 @@ inverts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -145,6 +146,7 @@ def solve(
     target: tuple[float, float],
     shape: tuple[int, int],
     start: Array,
+    tell: Callable[[str], None] = lambda stage: None,
 ) -> Transport:
     """Solve (1) from the coarsest grid up to `shape`.
 
@@ -153,6 +155,7 @@ def solve(
     - `size` is the size of the aperture.
     - `start` (6,) is the polynomial c0 + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2. It maps the aperture approximately
         evenly to the picture.
+    - `tell` receives the name of each stage.
 
     If the solver finds no solution for a sharp picture, it starts with a blurred picture.
     """
@@ -161,6 +164,7 @@ def solve(
         levels.append((-(-levels[-1][0] // 2), -(-levels[-1][1] // 2)))
     state: _State | None = None
     for n in reversed(levels):
+        tell(f"grid of {n[1]}x{n[0]}")
         state = _State(*_even(start, n, size), size, start) if state is None else _finer(state, n)
         nu = _shrunk(picture, max(n[0] / picture.shape[0], n[1] / picture.shape[1]))
         nu = nu / nu.mean()
@@ -533,16 +537,22 @@ def lifted(picture: Array, floor: float) -> Array:
 
 
 def least_floor(
-    optics: Optics, picture: Array, size: tuple[float, float], target: tuple[float, float], start: Array
+    optics: Optics,
+    picture: Array,
+    size: tuple[float, float],
+    target: tuple[float, float],
+    start: Array,
+    tell: Callable[[str], None] = lambda stage: None,
 ) -> float | None:
     """Return the lowest of `FLOORS` for which the transport neither folds nor tears, or None if the highest one
-    fails.
+    fails. `tell` receives the name of each trial.
     """
     ratio = size[0] / size[1]
     shape = (round(TRIAL / max(ratio, 1)), round(TRIAL * min(ratio, 1)))
     small = _shrunk(picture, TRIAL / max(picture.shape))
 
     def good(floor: float) -> bool:
+        tell(f"floor of {100 * floor:g} %")
         made = solve(optics, lifted(small, floor), size, target, shape, start)
         return made.converged and not made.folded and made.stretch < TORN
 

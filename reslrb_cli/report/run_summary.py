@@ -527,6 +527,9 @@ def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: 
     rest = (f"Try {remedy.words}:", remedy.command(manifest, folder)) if remedy is not None else ("", "")
     if rest[1] and not rest[1].startswith("reslrb "):
         rest = (f"{rest[0][:-1]}, with this in the configuration:", rest[1])
+    if better and results.get("is_design"):  # no true values, so no certainty is missing
+        export = shlex.join(["reslrb", "export", folder, "-o", "solid"])
+        return Outcome("good", f"{course}.", *(rest if rest[1] else ("Write the solid:", export)))
     course += _settled(verdicts, open_keys, better)
     if results.get("worse") and not open_keys:
         course += f". {shorten(results['worse'][0], KEY_WIDTH)} is farther from its true value than at the start"

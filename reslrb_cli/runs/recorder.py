@@ -323,6 +323,9 @@ class Recording:
         found = self._ended()
         if self.manifest.incomplete:
             found["incomplete"] = self.manifest.incomplete
+        config = self.problem.config
+        if config.fabrication is not None and not config.run.certainty:
+            found["is_design"] = True
         if self.certainty is not None:
             found["certainty"] = finite(self.certainty.to_json())
         if self.unmeasured:

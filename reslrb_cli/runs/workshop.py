@@ -278,6 +278,8 @@ def tolerances(
         say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")
 
     tell("as planned", planned)
+    if not bench.lamps:
+        say("the lamp is a point light: its width (fabrication.sun) and its rotations are left out")
     if plan.sun > 0 and bench.lamps:
         tell(f"light of {plan.sun:g} degrees", bench.sun(spp))
     for sign in (1, -1):

@@ -113,6 +113,10 @@ def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str
     result = CliRunner().invoke(command, args, catch_exceptions=False)
     assert result.exit_code == 0
     assert " mm deep; nothing darker" in result.output
+    assert re.search(r" x .* mm, .* cm\^3, least thickness .* mm; \d+ triangles\nface: .*cutter", result.output)
+    preview = np.asarray(Image.open(folder / "preview.png").convert("L"), float)
+    assert np.corrcoef(preview.ravel(), wanted.ravel())[0, 1] > 0.8, "another picture, or turned"
+    assert "preview.png: the caustic at the start; SSIM with the picture 0." in result.output
     heights = read_image(folder / "start.exr", "linear", signed=True)[:, :, 0]
     image = np.array(mi.render(flattened(heights, folder), spp=256, seed=1))[:, :, 1]
     target = read_image(folder / "target.exr")[:, :, 1]
@@ -136,6 +140,7 @@ BAD = {
     "incidence": (["--mirror", "0"], "--mirror: at 0 degrees the receiver blocks the mirror's"),
     "size": (["--size", "nan"], "--size: is nan mm; it must be above 0"),
     "thickness": (["--thickness", "0.5"], "--thickness: the relief is"),
+    "thin mirror": (["--mirror", "30", "--thickness", "0.01"], "mm into the mirror; thickness must be above"),
     "light": (["--light-distance", "20"], "--light-distance: is 20 mm, at which no lens was found"),
     "sun of a point": (["--sun", "0.5", "--light-distance", "300"], "--sun: needs parallel light"),
     "round": (["--mirror", "30", "--outline", "round", "--light-distance", "300"], "--outline: round needs parallel"),

@@ -188,6 +188,8 @@ def test_invalid_solids_are_refused() -> None:
          "fabrication.thickness: 1.5 mm: front and back overlap by 0.5 mm; it must be above 2"),
         (lambda: make_solid(dome, plan(thickness=2.05, rim=3.0)), "overlap by 0.05 mm"),
         (lambda: make_solid(as_sheet("face", points + np.array([1.0, 0, 0]), triangles), plan()), "must be at 0"),
+        (lambda: make_solid(as_sheet("face", points + np.array([0, 0, 30.0]), triangles), plan()),
+         "it must be about z = 0"),
     ]  # fmt: skip
     for make, line in cases:
         with pytest.raises(ConfigError) as error:

@@ -112,6 +112,7 @@ def test_distant_heights_match_the_paraxial_formula(kind: Literal["lens", "mirro
         ({"distance": np.nan}, "distance", "above 0"),
         ({"distance": 60.0, "picture_size": (300.0, 300.0)}, "distance", "by at most 48 degrees.*would do"),
         ({"thickness": 2.0}, "thickness", "thickness must be above .* or distance larger"),
+        ({"kind": "mirror", "incidence": 30.0, "thickness": 0.01}, "thickness", "into the mirror; thickness must"),
         ({"incidence": 90.0}, "incidence", "between"),
         ({"tilt": (85.0, 0.0)}, "tilt", "between"),
         ({"kind": "mirror"}, "incidence", "blocks the mirror's light; 30 degrees suffice"),

@@ -43,6 +43,19 @@ def test_only_a_falling_loss_and_settled_parameters_are_good() -> None:
         assert found.sentence == f"The loss fell, and 1 of 2 parameters settled. p1: {verdict}."
 
 
+def test_a_design_is_good_if_its_loss_fell() -> None:
+    """A lens has no true values. Its page therefore does not miss their certainty."""
+    fell: dict[str, Any] = {"iterations": 100, "loss_trend": FELL, "is_design": True}
+    good = outcome(fell)
+    assert (good.grade, good.command) == ("good", "reslrb export runs/room -o solid")
+    assert "certainty" not in good.sentence
+    assert outcome(fell | {"is_design": False}).grade == "open"
+    assert outcome(fell | {"loss_trend": {"change": "rose"}}).grade == "open"
+    falling = outcome(fell | {"loss_trend": FELL | {"late": "fell"}})
+    assert falling.grade == "good"
+    assert "--resume" in falling.command
+
+
 NOTHING = "so nothing shows that the values are better than at the start"
 
 
