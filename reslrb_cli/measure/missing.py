@@ -118,33 +118,38 @@ class Tracing:
         """Return the change of the images from `low` to `high` relative to their size. Products of two independent
         images have no bias from noise.
         """
-        first, second = ([self._see(vector, s, seed) for s in (low, high)] for seed in PILOTS)
+        (a, b), (c, d) = (self._see(vector, s, PILOTS) for s in (low, high))
         change = size = 0.0
-        for a, b, c, d in zip(*first, *second, strict=True):
-            change += float(np.sum((b - a) * (d - c)))
-            size += float(np.sum(a * c))
+        for first, second, third, fourth in zip(a, b, c, d, strict=True):
+            change += float(np.sum((third - first) * (fourth - second)))
+            size += float(np.sum(first * second))
         return float(np.sqrt(max(change, 0.0) / size)) if size > 0 else 0.0
 
-    def _see(self, vector: np.ndarray, s: float, seed: int) -> list[np.ndarray]:
-        """Return the images (H, W, C) of all views at x + s `vector`."""
+    def _see(self, vector: np.ndarray, s: float, seeds: Sequence[int]) -> list[list[np.ndarray]]:
+        """Return the images (H, W, C) of all views at x + s `vector`, for each seed."""
         self.move(vector, s)
-        self.spent += self.spp
-        return [case.image(self.images, seed, self.spp) for case in self.cases]
+        self.spent += self.spp * len(seeds)
+        return [[case.image(self.images, seed, self.spp) for case in self.cases] for seed in seeds]
 
-    def sample(self, segment: LineSegment, seed: int) -> tuple[float, float]:
-        """Return the difference along a segment and the gradient at a random point of it, both for one seed."""
-        ends = [
-            sum(float(np.sum(image * weights)) for image, weights in zip(images, segment.weights, strict=True))
-            for images in (self._see(segment.vector, s, seed) for s in (segment.low, segment.high))
-        ]
-        self.move(segment.vector, np.random.default_rng(seed).uniform(segment.low, segment.high))
-        self.spent += self.spp
-        gradient = 0.0
-        for case, weights in zip(self.cases, segment.weights, strict=True):
-            case.weigh(weights)
-            row = case.gradient(self.gradients, seed, self.spp, step=case.known_step)
-            gradient += float(segment.vector @ row)
-        return (ends[1] - ends[0]) / (segment.high - segment.low), gradient
+    def sample(self, segment: LineSegment, seeds: Sequence[int]) -> np.ndarray:
+        """Return the difference along a segment and the gradient at a random point of it, for each seed: (N, 2).
+
+        All images of an end are rendered together, because a move may build the scene anew.
+        """
+        found = np.zeros((len(seeds), 2))
+        for s, sign in ((segment.high, 1), (segment.low, -1)):
+            for row, images in zip(found, self._see(segment.vector, s, seeds), strict=True):
+                pairs = zip(images, segment.weights, strict=True)
+                row[0] += sign * sum(float(np.sum(image * weights)) for image, weights in pairs)
+        found[:, 0] /= segment.high - segment.low
+        for row, seed in zip(found, seeds, strict=True):
+            self.move(segment.vector, np.random.default_rng(seed).uniform(segment.low, segment.high))
+            self.spent += self.spp
+            for case, weights in zip(self.cases, segment.weights, strict=True):
+                case.weigh(weights)
+                gradient = case.gradient(self.gradients, seed, self.spp, step=case.known_step)
+                row[1] += float(segment.vector @ gradient)
+        return found
 
     def weigh(self, segment: LineSegment, problem: Problem, views: Sequence[View], spp: int) -> LineSegment:
         """Return the segment with the weights dL/dI at its end with the higher loss."""
@@ -176,11 +181,11 @@ class Missing:
     ours: list[np.ndarray] = field(default_factory=list)
     differences: list[np.ndarray] = field(default_factory=list)
 
-    def take(self, tracing: Tracing, seed: int) -> None:
-        """Add one seed."""
-        found = np.array([tracing.sample(segment, seed) for segment in self.segments])
-        self.differences.append(found[:, 0])
-        self.ours.append(found[:, 1])
+    def take(self, tracing: Tracing, seeds: Sequence[int]) -> None:
+        """Add samples with these seeds."""
+        found = np.array([tracing.sample(segment, seeds) for segment in self.segments])
+        self.differences += list(found[:, :, 0].T)
+        self.ours += list(found[:, :, 1].T)
 
     @property
     def count(self) -> int:
@@ -306,7 +311,7 @@ class MissingCheck:
             enough = found.count >= FEWEST and (stop() or (self._count is None and time.perf_counter() > end))
             if enough:
                 break
-            found.take(self._tracing, seed)
+            found.take(self._tracing, [seed])
             between()
 
 
@@ -458,14 +463,12 @@ class _Short:
             found = Missing([tracing.weigh(each, problem, self._views, image_spp) for each in segments])
         if not any(np.any(weights) for segment in found.segments for weights in segment.weights):
             return MissingRecord(source, key, None, None, len(directions), 0)
-        look, most = FEWEST, min(MOST_SEEDS, int((end - tracing.spent) // at_a_seed))
-        for seed in seeds(most):
-            found.take(tracing, seed)
-            if found.count in (look, most):
-                look *= GROWTH
-                record = found.record(source, key)
-                if record.is_decided:
-                    break
+        most, record = min(MOST_SEEDS, int((end - tracing.spent) // at_a_seed)), None
+        while found.count < most and (record is None or not record.is_decided):
+            look = min(max(FEWEST, GROWTH * found.count), most)
+            found.take(tracing, seeds(most)[found.count : look])
+            record = found.record(source, key)
+        assert record is not None
         return record
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -216,11 +217,11 @@ def simulated(directions: int, share: float, whole: float, noise: float, count: 
         def weigh(self, segment: LineSegment, *_: Any) -> LineSegment:
             return replace(segment, weights=[np.ones(1)])
 
-        def sample(self, segment: LineSegment, seed: int) -> tuple[float, float]:
-            self.spent += 3 * self.spp
-            a, b, _ = random.normal(size=3)
-            difference = whole + 1.7 * noise * a + noise * b
-            return difference, difference - share * whole - noise * b
+        def sample(self, segment: LineSegment, seeds: Sequence[int]) -> np.ndarray:
+            self.spent += 3 * self.spp * len(seeds)
+            a, b = random.normal(size=(2, len(seeds)))
+            differences = whole + 1.7 * noise * a + noise * b
+            return np.transpose([differences, differences - share * whole - noise * b])
 
     short: Any = object.__new__(_Short)
     short.problem = SimpleNamespace(config=SimpleNamespace(source="a.yaml", run=SimpleNamespace(spp=16)))
@@ -260,8 +261,8 @@ def test_long_segments_have_no_truncation_error():
         def move(self, vector: np.ndarray, s: float) -> None:
             self.at = s
 
-        def _see(self, vector: np.ndarray, s: float, seed: int) -> list[np.ndarray]:
-            return [np.array([np.sin(3 * s)])]
+        def _see(self, vector: np.ndarray, s: float, seeds: Sequence[int]) -> list[list[np.ndarray]]:
+            return [[np.array([np.sin(3 * s)])]] * len(seeds)
 
     case: Any = SimpleNamespace(
         weigh=lambda weights: None, known_step=None,
@@ -269,8 +270,7 @@ def test_long_segments_have_no_truncation_error():
     )  # fmt: skip
     bent = Bent([case], None, None, 1)
     found = Missing([LineSegment(np.ones(1), -0.1, 0.5, [np.ones(1)])])
-    for seed in range(400):
-        found.take(bent, seed)
+    found.take(bent, range(400))
     record = found.record("a.yaml", "x")
     assert not record.is_incomplete, record
     middle = 3 * np.cos(0.6) / found.differences[0][0] - 1

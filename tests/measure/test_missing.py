@@ -50,8 +50,7 @@ def share(scene: AttachedScene, count: int = SEEDS) -> tuple[float, float]:
     tracer = integrator("reslrb", **options, estimator="stack")
     tracing = Tracing([case], integrator("walk_ad", **options), tracer, SPP)
     found = Missing([LineSegment(np.ones(1), -REACH, REACH, [centre_of_gravity()])])
-    for seed in seeds(count):
-        found.take(tracing, seed)
+    found.take(tracing, seeds(count))
     record = found.record("", "")
     assert record.share is not None
     assert record.standard_error is not None
