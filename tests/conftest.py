@@ -17,6 +17,7 @@ import pytest
 from compilation import allocate_registers, combine, compute_alone, leave_out_optimisations, show_fatal_errors
 from kit import with_wavelengths, work_in
 from report.chromium import Chromium, find_chromium
+from turns import in_part, read_part
 
 import reslrb_cli  # noqa: F401  # chooses libLLVM, so it comes before any test imports Mitsuba
 from reslrb_cli.backend.variant import set_variant
@@ -26,8 +27,18 @@ from reslrb_cli.errors import BackendError
 HEAVY = ("colour", "matplotlib.pyplot", "reslrb_cli.cli.optimize", "reslrb_cli.report.page", "reslrb_cli.runs.recorder")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    text = "Run the K-th of N parts of the chosen tests. Each part has a share of each file."
+    parser.addoption("--part", type=read_part, metavar="K/N", default=(1, 1), help=text)
+
+
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out tests that need a browser if there is no browser."""
+    """Leave out the tests of other parts, and tests that need a browser if there is no browser."""
+    chosen = in_part(items, *config.getoption("part"))
+    if len(chosen) < len(items):
+        config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+        items[:] = chosen
     if find_chromium() is None:
         left_out = [item for item in items if "chromium" in getattr(item, "fixturenames", ())]
         config.hook.pytest_deselected(items=left_out)

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from turns import common_setup
+from turns import common_setup, in_part, read_part
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ["scripts/setup", "scripts/demo", "scripts/test", "scripts/paper", "scripts/benchmarks", "scripts/gpu_check",
@@ -32,6 +32,21 @@ def test_scripts_are_executable_and_valid(name: str) -> None:
 def test_unknown_words_are_refused(script: str, word: str) -> None:
     done = subprocess.run([ROOT / "scripts" / script, word], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr.startswith(f"usage: scripts/{script}")) == (2, True)
+
+
+def test_parts_have_each_test_once() -> None:
+    items = [SimpleNamespace(path=file, name=n) for file, count in (("a", 7), ("b", 1), ("c", 2), ("d", 30), ("e", 1))
+             for n in range(count)]  # fmt: skip
+    for parts in (1, 2, 3, 8, 50):
+        found = [in_part(items, part, parts) for part in range(1, parts + 1)]  # type: ignore[arg-type]
+        assert sorted((each.path, each.name) for part in found for each in part) == sorted(
+            (each.path, each.name) for each in items
+        )
+        if parts <= 8:
+            assert max(map(len, found)) <= len(items) / parts + 3
+    for wrong in ("3/2", "0/2", "2", "a/b"):
+        with pytest.raises(ValueError):  # noqa: PT011  # by `int` or by the function
+            read_part(wrong)
 
 
 #: A substitute for Python that makes an environment of itself, and finds every package there.
@@ -101,8 +116,8 @@ def test_without_chromium_the_tests_say_so_in_one_line(
     monkeypatch.setattr(common, "find_chromium", lambda: None)
     said, left_out = [], []
     hook = SimpleNamespace(pytest_deselected=lambda items: left_out.extend(items))
-    items = [SimpleNamespace(fixturenames=("chromium", "pages")), SimpleNamespace(fixturenames=())]
-    common.pytest_collection_modifyitems(SimpleNamespace(hook=hook), items)
+    items = [SimpleNamespace(fixturenames=names, path="a") for names in (("chromium", "pages"), ())]
+    common.pytest_collection_modifyitems(SimpleNamespace(hook=hook, getoption=lambda name: (1, 1)), items)
     assert (len(items), len(left_out)) == (1, 1)
     common.pytest_terminal_summary(SimpleNamespace(write_line=said.append))
     assert [line.partition(":")[0] for line in said] == ["no Chromium"]

@@ -1,7 +1,10 @@
-"""Parameters of which the default suite runs only a part, and a scene of another author, if available."""
+"""Parameters of which the default suite runs only a part, parts of the long tests, and a scene of another author, if
+available.
+"""
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
@@ -72,3 +75,23 @@ def real_room() -> Path:
             f"The Grey & White Room (Wig42, CC BY 3.0) is not in {folder}; set RESLRB_GREY_WHITE_ROOM to its folder"
         )
     return folder / "scene.xml"
+
+
+# Parts of the long tests, of which each fits into 25 minutes (`--part K/N`).
+
+
+def read_part(text: str) -> tuple[int, int]:
+    """Return the numbers in `K/N`. Raises ValueError."""
+    part, parts = map(int, text.split("/"))
+    if not 1 <= part <= parts:
+        raise ValueError(f"{text}: the first number must be between 1 and the second")
+    return part, parts
+
+
+def in_part(items: Sequence[pytest.Item], part: int, parts: int) -> list[pytest.Item]:
+    """Return the items in a part. Neighbours in a file stay together, because they share fixtures and kernels."""
+    chosen: list[pytest.Item] = []
+    for n, (_, group) in enumerate(itertools.groupby(items, lambda item: item.path)):
+        inside, at = list(group), (part - 1 + n) % parts  # the extra items of small files fall into different parts
+        chosen += inside[at * len(inside) // parts : (at + 1) * len(inside) // parts]
+    return chosen

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from cli import tiny
 from cli.tiny import reslrb
+from kit import wait_for
 
 from reslrb_cli.cli import jobs, sweep
 from reslrb_cli.config.loader import load
@@ -357,6 +358,30 @@ def test_a_run_that_must_end_is_ended(monkeypatch):
     code, line = jobs.call([], sweep.Interrupts(), slot)
     assert (code, line.startswith("ended by SIGTERM: ")) == (130, True)
     assert time.monotonic() - start < 30
+
+
+def test_a_sweep_that_ends_at_once_ends_its_runs_with_a_last_act(tmp_path, monkeypatch):
+    """A run marks its manifest as interrupted at the second signal."""
+    script = f"""
+import time
+from pathlib import Path
+from reslrb_cli.cli.terminal import Interrupts
+with Interrupts(last_act=lambda: Path({str(tmp_path / "last act")!r}).touch()):
+    print("1/5: at work", flush=True)
+    time.sleep(60)
+"""
+    monkeypatch.setattr(jobs, "_PROGRAM", f"exec({script!r})")
+    at_once, ends = jobs.Jobs(1, "llvm_ad_rgb"), []
+    (slot,) = at_once.slots
+    thread = threading.Thread(target=lambda: ends.append(jobs.call([], sweep.Interrupts(), slot)))
+    thread.start()
+    wait_for(lambda: slot.line, 60)
+    start = time.monotonic()
+    at_once.end()
+    assert time.monotonic() - start < jobs.END_SECONDS
+    thread.join(20)
+    assert ends == [(130, "interrupted")]
+    assert (tmp_path / "last act").exists()
 
 
 def test_trials_at_work_are_avoided(folder):
