@@ -6,6 +6,8 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -19,10 +21,24 @@ from reslrb_cli.glasses import find_glass
 from reslrb_cli.records.images import luminance, write_file
 from reslrb_cli.report.format import number
 from reslrb_cli.runs import export, workshop
-from reslrb_cli.runs.workshop import OpticalBench, figures, shift_between, where_light_goes
+from reslrb_cli.runs.workshop import OpticalBench, figures, shift_between, tolerances, where_light_goes
 
 PTRACER = {"type": "ptracer", "max_depth": 4}
 FLAT = Fabrication(thickness=25.0, ior="PMMA")
+
+
+def test_a_point_light_says_what_is_left_out() -> None:
+    """Only lamps with a surface can be wider or rotated."""
+    image = np.pad(np.random.default_rng(0).uniform(0.5, 1, (16, 16)), 4)
+    plan = SimpleNamespace(sun=0.53, kind="mirror", glass=None)
+    for lamps, count in (([], 1), (["lamp"], 0)):
+        bench: Any = SimpleNamespace(
+            lamps=lamps, plan=plan, solid_parts=list, farther=lambda part: {}, turned=lambda *_: {},
+            image=lambda *_: image, sun=lambda spp: image,
+        )  # fmt: skip
+        said: list[str] = []
+        tolerances(bench, image, image, 1, said.append)
+        assert sum("point light: its width (fabrication.sun)" in line for line in said) == count
 
 
 def test_shift_and_figures_match_a_known_change_of_a_picture() -> None:
