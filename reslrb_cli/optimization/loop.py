@@ -196,11 +196,8 @@ def measure_block(problem: Problem, iteration: int) -> None:
         return
     scales = {key: 0.5 * max(optimizer.extent(key), 1e-30) if optimizer.variable(key).transform is None
               else rms(problem.selection.array(key)) or 1.0 for key in block.at}  # fmt: skip
-    changes, part, unit = (
-        plan_changes(problem, scales, DISPLACEMENT),
-        part_of_samples(problem),
-        problem.samples_per_pass or 1,
-    )
+    changes = plan_changes(problem, scales, DISPLACEMENT)
+    part, unit = part_of_samples(problem), problem.samples_per_pass or 1
     images = 2 * (len(changes) + 1) * len(problem.trained) / len(problem.drawn(iteration))
     cost, least = (images * spp / problem.config.run.spp for spp in (part, unit))
     paid = payment(iteration, cost, least)
@@ -261,7 +258,7 @@ def exposed_images(problem: Problem, iteration: int) -> list[mi.TensorXf]:
         at = seed(problem.config.run.seed, iteration, view.sensor, "step length")
         image = render_image(problem.integrator, problem.scene, view.sensor, at, part_of_samples(problem))
         images.append(view.exposed(image))
-        count = count_nonfinite(images[-1])
+        count = count_nonfinite(images[-1] if view.weights is None else dr.select(view.weights > 0, images[-1], 0))
         dr.eval(images[-1], count)
         problem.left_out[f"a measured image of sensor {view.sensor}"] += int(count[0])
     return images

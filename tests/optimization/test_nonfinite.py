@@ -18,7 +18,7 @@ from optimization.judged import POSTER, WALL, write_scene
 import reslrb_cli.integrators.step as real
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import NonFinite
-from reslrb_cli.optimization import assemble, identifiability, loop
+from reslrb_cli.optimization import assemble, identifiability, loop, sensitivity
 from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty import measuring
@@ -213,6 +213,22 @@ def test_losses_before_and_after_a_step_lack_the_same_pixels(render):
         expected.append(np.mean(np.where(seen == 1, image - target, 0) ** 2))
     found = loop.blurred_losses(problem, 0, *([mi.TensorXf(image.astype(np.float32))] for image in (before, after)))
     np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("module", [loop, sensitivity])
+def test_excluded_pixels_may_hold_any_value(module, render, monkeypatch):
+    """They are neither counted, nor do they end a run with `stop`."""
+    _, problem, _, _ = render("auto, moving")
+    view, weights = problem.views[0], np.ones((SIZE, SIZE), np.float32)
+    weights[2, 3] = weights[5, 1] = 0
+    image = np.array(view.target)
+    image[2, 3, 1], image[5, 1, 0] = np.nan, np.inf
+    monkeypatch.setattr(module, "render_image", lambda *given: mi.TensorXf(image))
+    measure = {loop: lambda: loop.exposed_images(problem, 0), sensitivity: lambda: sensitivity.see_images(problem)}
+    for kept, count in ((weights, 0), (None, 2)):
+        view.weigh(kept)
+        measure[module]()
+        assert sum(problem.take_left_out().values()) == count
 
 
 def test_samples_with_gaps_keep_the_mean_of_the_others():
