@@ -1,12 +1,13 @@
 """Every plugin that Mitsuba 3.9.1 ships, and those of `reslrb` for scenes, in a separate scene, and how the program
 treats this scene. This module is docs/plugins.md as data.
 
-`python tests/cli/every_plugin.py` writes the page again. Each plugin has at least one row. Each place or form of the
-plugin that is treated differently has another row.
+`python tests/cli/every_plugin.py` writes the page again. Its table of derivatives is from conformance/keys.json. Each
+plugin has at least one row. Each place or form of the plugin that is treated differently has another row.
 """
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import numpy as np
 
 from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT, SENSITIVITY
 
+KEYS = Path(__file__).resolve().parents[1] / "conformance" / "keys.json"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
 #: Kinds of plugins, and the headings of the page for them.
 KINDS = {"bsdf": "BSDFs", "shape": "Shapes", "emitter": "Emitters", "texture": "Textures and spectra",
@@ -466,7 +468,56 @@ def page() -> str:
                     f"refused: {REASONS[why]}" if why else f"works{note}" for why in (row.light, row.camera)
                 )
                 parts.append(f"| {name} | {light}{without} | {camera} |\n")
-    return "".join(parts)
+    return "".join([*parts, DERIVATIVES, *derivatives()])
+
+
+DERIVATIVES = """
+## Derivatives
+
+Each parameter that `reslrb inspect` lists as recoverable is tested: its derivative by `reslrb` is compared with
+differences of images at the same random numbers, inside of its range and at both bounds. The objective is a weighted
+sum of pixels. A cell has the difference, the derivative, and the standard error of their distance. Differences have an
+error of up to 2 % by their step. A derivative that is 10 % off fails the test. `pytest -m long
+tests/conformance/test_every_key.py` repeats all comparisons; without `-m long` it repeats two.
+Parameters that move light have tests of their own.
+
+Stock Mitsuba 3.9.1 fails some of these comparisons. `reslrb` corrects or refuses:
+
+- `alpha` and `eta` of `roughplastic`. Mitsuba's tables of the transmittance have no derivatives, so the sign or the
+    size is wrong. `reslrb` adds the derivative of the tables.
+- `spec_trans`, `metallic`, `clearcoat` and `sheen` of `principled`; `spec_trans`, `diff_trans` and `sheen` of
+    `principledthin`; blend weight; opacity; the colours of a smooth `plastic`. Mitsuba leaves out a lobe of weight 0,
+    so the derivative at a bound is 0. A run keeps these parameters 0.001 away from such a bound.
+- `eta` and `k` of conductors have the derivative 0 at 0. `base_color` and `specular` of `principled`, and `base_color`
+    of `principledthin`, have an infinite derivative there. A run keeps them at 0.001 or more.
+- `clearcoat_gloss` and `sheen_tint`; `eta`, `anisotropic` and `spec_tint` of `principledthin`. They have no effect
+    while the weight of their lobe is 0, and are refused if the weight is not recovered as well.
+- `theta` and `delta` of polarisers and retarders have no effect without polarised light, and are refused.
+- `spec_trans` of a `principled` in a `twosided` is refused: Mitsuba does not load such a file.
+
+| plugin | parameter | inside, light paths | inside, camera paths | at the lower bound | at the upper bound |
+|---|---|---|---|---|---|
+"""
+
+
+def derivatives() -> list[str]:
+    """Return the rows of the table of derivatives."""
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for one in json.loads(KEYS.read_text(encoding="utf-8")):
+        place = f"inside {one['paths']}" if one["at"] == "inside" else one["at"]
+        fd, ad, error = f"{one['fd']:.3g}", f"{one['ad']:.3g}", f"{one['error']:.0e}"
+        found.setdefault((one["form"], one["key"]), {})[place] = f"{fd} / {ad} ± {error}"
+    rows = []
+    for (form, key), cells in found.items():
+        plugin, _, options = form.partition(" ")
+        name = key.removeprefix("thing.").removeprefix("bsdf.")
+        values = [cells.get(place, "") for place in ("inside light", "inside camera", "low", "high")]
+        rows.append(f"| `{plugin}`{f' {options}' if options else ''} | `{name}` | {' | '.join(values)} |\n")
+    measured = {form.partition(" ")[0] for form, _ in found}
+    tested = dict.fromkeys(row.plugin for row in ROWS if row.kind in ("bsdf", "emitter", "texture") and not row.refused)
+    others = [f"`{name}`" for name in tested if name not in measured]
+    note = f"\nThe long test also covers these plugins, whose numbers are not in the table: {', '.join(others)}.\n"
+    return [*rows, note] if others else rows
 
 
 if __name__ == "__main__":
