@@ -90,6 +90,7 @@ SIMILAR = (
     "reflected-area-3",  # the slab has edges and shadows of both kinds of chains
     "mirror-constant-3",
     "smooth-front-2",
+    "square_0.3-paned-4",
 )
 
 
