@@ -57,8 +57,12 @@ BY_NAME = {case.name: case for case in CASES}
 
 #: Largest standard error of a gradient and its reference, relative to the norm of the reference.
 RESOLUTION = 0.02
-#: The same for light of more than two segments, which has more noise.
+#: The same for light of more than two segments, for shapes with light at grazing angles, and for cases without
+#: differences on file. They have more noise.
 NOISY = 0.07
+GRAZED, ON_FILE = ("bumpy", "cylinder"), [case.name for case in RECORDED]
+#: Factors of the samples of light paths, by case. Camera paths need no more.
+MORE_SAMPLES = {"box-sphere_lamp-2": 5, "sphere-point-2": 4, "standing-front-2": 2, "flat-area-2": 2}  # fmt: skip
 
 
 def check(case: EdgeCase, reference: np.ndarray, **options: Any) -> Agreement:
@@ -70,7 +74,8 @@ def check(case: EdgeCase, reference: np.ndarray, **options: Any) -> Agreement:
     size = np.linalg.norm(reference.mean(0))
     agreement = compare(found, reference, block=None)
     print(f"{case.name}: {agreement}; standard error {noise / size:.1%} of the gradient")
-    noisy = case.depth > 2 and case.lamp not in VIEWS and case.occluder != "two"
+    bounces = case.depth > 2 and case.lamp not in VIEWS and case.occluder != "two"
+    noisy = bounces or case.occluder in GRAZED or case.name not in ON_FILE
     assert noise < (NOISY if noisy else RESOLUTION) * size, (
         f"{case.name}: standard error {noise / size:.1%} of the gradient"
     )
@@ -97,7 +102,7 @@ SIMILAR = (
 @pytest.mark.usefixtures("registers")
 @pytest.mark.parametrize("case", a_few(RECORDED, [case.name for case in RECORDED if case.name not in SIMILAR]))
 def test_gradient(case: EdgeCase):
-    agreement = check(case, recorded(case))
+    agreement = check(replace(case, spp=case.spp * MORE_SAMPLES.get(case.name, 1)), recorded(case))
     assert agreement, agreement
 
 
@@ -120,7 +125,8 @@ def test_gradient_with_new_differences(case: EdgeCase):
     """The differences on file agree with new ones of the scenes as they are now."""
     differences = case.differences(block=2)
     noisy = case.occluder in ("glazed", "slab")  # light through glass has more noise
-    agreement = check(replace(case, spp=case.spp * (4 if noisy else 1)), differences)
+    spp = case.spp * (4 if noisy else MORE_SAMPLES.get(case.name, 1))
+    agreement = check(replace(case, spp=spp), differences)
     assert agreement, agreement
     if case in RECORDED:
         on_file = compare(recorded(case), differences, block=None)
