@@ -367,6 +367,25 @@ def test_the_end_of_a_script_completes_its_folders(name: str, experiment: Path) 
         assert files(experiment / folder) >= tiny.COMPLETE
 
 
+def test_a_signal_waits_for_the_end_of_a_step_and_acts_during_a_loop_alone(experiment: Path) -> None:
+    end_by, done = experiment_module.end_by, list[int]()
+    run = rl.optimize("tiny.yaml", overrides=SET | {"run.iterations": 1})
+
+    def work() -> None:
+        with experiment_module.held() as stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.05)
+            assert stop()
+            done.append(1)  # an exception in the midst of a kernel would end the process
+
+    for _ in run:
+        assert [signal.getsignal(number) for number in experiment_module.KILLING] == [end_by, end_by]
+        with pytest.raises(SystemExit) as end:
+            work()
+        assert (end.value.code, done) == (143, [1])
+    assert [signal.getsignal(number) for number in experiment_module.KILLING] == [signal.SIG_DFL, signal.SIG_DFL]
+
+
 def test_folder_replaces_the_output_of_the_experiment(experiment: Path) -> None:
     config = rl.load("tiny.yaml", {**SET, "run.output": "elsewhere"})
     assert rl.optimize(config, folder="mine").config.run.output == experiment
