@@ -275,7 +275,7 @@ class Progress:
 
     def _left(self, record: Record) -> str:
         """Return the time that the remaining iterations will take, as the forecast of a run estimates it."""
-        from reslrb_cli.optimization.forecast import Pace
+        from reslrb_cli.optimization.forecast import IterationTimes
 
         if len(self._records) == RECENT:
             self._before_s = self._records[0].elapsed_s
@@ -283,8 +283,8 @@ class Progress:
             self._before_s = record.elapsed_s - record.step_ms / 1e3 - record.curvature_s
         self._records.append(record)
         optimizer = None if self._problem is None else self._problem.optimizer
-        pace = Pace.of(list(self._records), optimizer, self._before_s)
-        left_s = pace.seconds(record.iteration + 1, self._total)
+        times = IterationTimes.of(list(self._records), optimizer, self._before_s)
+        left_s = times.seconds(record.iteration + 1, self._total)
         if self._problem is not None and self._problem.limit_s is not None:
             left_s = max(min(left_s, self._problem.limit_s - record.elapsed_s), 0.0)
         most = "at most " if optimizer is not None and optimizer.measures_curvature else ""

@@ -35,7 +35,7 @@ USUAL, NOTICED = (LEAST_ITERATIONS, 50), 0.05
 
 
 @dataclass(frozen=True)
-class Pace:
+class IterationTimes:
     """Expected times of a run's iterations, without compilation: `step_s` of each, and of measurements of curvature.
 
     With `auto`, `gradient_s` is the time of a measurement for large parameters, and `joint_s` of one for small ones. A
@@ -47,8 +47,8 @@ class Pace:
     joint_s: float = 0.0
 
     @classmethod
-    def of(cls, records: Sequence[Record], optimizer: Optimizer | None, before_s: float = 0.0) -> Pace:
-        """Return the pace that consecutive records show. `before_s` is `elapsed_s` before the first one."""
+    def of(cls, records: Sequence[Record], optimizer: Optimizer | None, before_s: float = 0.0) -> IterationTimes:
+        """Return the times that consecutive records show. `before_s` is `elapsed_s` before the first one."""
         ends = [before_s, *(record.elapsed_s for record in records)]
         times = [after - before - record.curvature_s for (before, after), record in
                  zip(pairwise(ends), records, strict=True)]  # fmt: skip
@@ -75,10 +75,10 @@ class Pace:
         return (last - first) * self.step_s + large * self.gradient_s + joint * self.joint_s
 
 
-def measure_steps(problem: Problem) -> tuple[Pace, float, float, int]:
+def measure_steps(problem: Problem) -> tuple[IterationTimes, float, float, int]:
     """Take a few steps of `problem`, which then has other values.
 
-    Returns the pace, the additional seconds of the first steps with cached kernels, the current seconds for compiling,
+    Returns the times, the additional seconds of the first steps with cached kernels, the current seconds for compiling,
     and the peak in bytes, which corresponds to `peak_mib` in `metrics.jsonl`.
     """
     run = problem.config.run
@@ -92,13 +92,13 @@ def measure_steps(problem: Problem) -> tuple[Pace, float, float, int]:
             break
         if timed >= MOST or (timed >= LEAST and record.elapsed_s - records[WARM_UP - 1].elapsed_s > SECONDS):
             break
-    pace = Pace.of(records, problem.optimizer)
+    times = IterationTimes.of(records, problem.optimizer)
     first = min(WARM_UP, len(records) - 1)
-    extra = max(records[first - 1].elapsed_s - pace.seconds(0, first), 0.0) if first else 0.0
+    extra = max(records[first - 1].elapsed_s - times.seconds(0, first), 0.0) if first else 0.0
     compiled = min(sum(record.codegen_ms for record in records[:first]) / 1e3, extra)
     # Kernels that run only when values change, for example to 0, do not count.
     peak = int(records[: run.iterations][-1].peak_mib * MIB)
-    return pace, extra - compiled, compiled, peak
+    return times, extra - compiled, compiled, peak
 
 
 def forecast_lines(
@@ -116,22 +116,22 @@ def forecast_lines(
     # Errors are not part of a step.
     problem = before(replace(assemble(with_short_target(config, 4 * config.run.spp), say, cache), truth={}))
     say("measuring a few steps")
-    pace, start_s, compile_s, peak = measure_steps(problem)
+    times, start_s, compile_s, peak = measure_steps(problem)
     iterations = config.run.iterations
     if config.run.max_seconds is not None:
         left_s = config.run.max_seconds - problem.measured_s - start_s
-        fitting = bisect.bisect_right(range(1, iterations + 1), left_s, key=lambda count: pace.seconds(0, count))
+        fitting = bisect.bisect_right(range(1, iterations + 1), left_s, key=lambda count: times.seconds(0, count))
         iterations = max(fitting, 1)
-    elapsed_s = pace.seconds(0, iterations) + start_s
-    sums = f"{iterations} x {1e3 * pace.step_s:.3g} ms"
-    curvature_s = elapsed_s - start_s - iterations * pace.step_s
+    elapsed_s = times.seconds(0, iterations) + start_s
+    sums = f"{iterations} x {1e3 * times.step_s:.3g} ms"
+    curvature_s = elapsed_s - start_s - iterations * times.step_s
     sums += f" + {duration(curvature_s)} to measure curvature" if curvature_s > 0.01 * elapsed_s else ""
     sums += f" + {duration(start_s)}" if start_s > 0.01 * elapsed_s else ""
     ends, most = "", ""
     if problem.optimizer.measures_curvature and iterations > USUAL[0]:
         usual = USUAL[0], min(USUAL[1], iterations)
-        times = " to ".join(duration(pace.seconds(0, end) + start_s) for end in usual)
-        most, ends = "at most ", f"; `auto` usually ends after {usual[0]} to {usual[1]} iterations ({times})"
+        spans = " to ".join(duration(times.seconds(0, end) + start_s) for end in usual)
+        most, ends = "at most ", f"; `auto` usually ends after {usual[0]} to {usual[1]} iterations ({spans})"
     return [
         f"memory of the iterations: at most {in_words(peak)}; {in_words(free_bytes(mi.variant()))} are free",
         f"memory of the whole process: {in_words(resident_bytes())}, with Python, libraries and the code of kernels",

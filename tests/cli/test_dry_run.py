@@ -143,7 +143,7 @@ def test_the_bar_agrees_with_the_forecast(kind: str) -> None:
 def test_the_time_in_words(sets: list[str], expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = make_problem(tmp_path, sets=["run.iterations=100", *sets])
     is_auto = problem.optimizer.measures_curvature
-    pace = forecast.Pace(0.5, 0.4, 0.0) if is_auto else forecast.Pace(0.5)
+    pace = forecast.IterationTimes(0.5, 0.4, 0.0) if is_auto else forecast.IterationTimes(0.5)
     monkeypatch.setattr(forecast, "assemble", lambda *given: problem)
     monkeypatch.setattr(forecast, "measure_steps", lambda problem: (pace, 15.0 * is_auto, 2.0, 2**20))
     lines = forecast.forecast_lines(problem.config, lambda line: None)
