@@ -312,6 +312,27 @@ def test_a_run_continues_from_its_folder(experiment: Path, caplog: pytest.LogCap
     assert [record.iteration for record in longer] == [6]
 
 
+def test_one_thread_at_a_time_records(llvm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next one records when the first has ended."""
+    from reslrb_cli.integrators import freezing
+
+    monkeypatch.setattr(freezing, "_recorder", None)
+    found, go_on = list[bool](), threading.Event()
+
+    def work() -> None:
+        found.append(freezing._may_record())
+        go_on.wait(20)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    while not found:
+        time.sleep(0.001)
+    found.append(freezing._may_record())
+    go_on.set()
+    thread.join(20)
+    assert [*found, freezing._may_record()] == [True, False, True]
+
+
 def test_a_folder_keeps_its_name(experiment: Path) -> None:
     run = rl.optimize("tiny.yaml", folder="mine/my run #1 (é)", overrides=SET | {"run.iterations": 1})
     list(run)
