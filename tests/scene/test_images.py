@@ -402,6 +402,18 @@ def test_primaries_of_an_exr_are_converted_with_or_without_other_channels(tmp_pa
     assert abs(alone[0, 0] - [0.25, 0.5, 0.75]).max() > 0.02
 
 
+def test_alpha_is_that_of_the_layer_of_the_colours(tmp_path):
+    import OpenEXR
+
+    planes = {name: np.full((2, 2), 0.5, np.float32) for name in LAYERS}
+    planes |= {"A": np.zeros((2, 2), np.float32), "ViewLayer.Combined.A": np.float32([[1, 1], [0, 0.25]])}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    photo = read_photo(tmp_path / "a.exr")
+    assert photo.alpha.tolist() == [[1, 1], [0, 0.25]]
+    assert np.argwhere(photo.transparent).tolist() == [[1, 0]]
+
+
 def test_several_layers_are_refused(tmp_path):
     (tmp_path / "a.exr").write_bytes(exr_of(["a.R", "a.G", "a.B", "b.R", "b.G", "b.B"], np.float32)[0])
     assert refused(tmp_path / "a.exr") == "has the layers a, b; save the one of the image alone"
