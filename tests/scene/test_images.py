@@ -414,6 +414,16 @@ def test_alpha_is_that_of_the_layer_of_the_colours(tmp_path):
     assert np.argwhere(photo.transparent).tolist() == [[1, 0]]
 
 
+def test_channels_without_a_layer_come_first(tmp_path):
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    planes = {f"{layer}{name}": np.full((2, 2), value, np.float32)
+              for layer, value in (("", 0.25), ("Combined.", 0.5)) for name in "RGB"}  # fmt: skip
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    assert (read_image(tmp_path / "a.exr") == 0.25).all()
+
+
 def test_several_layers_are_refused(tmp_path):
     (tmp_path / "a.exr").write_bytes(exr_of(["a.R", "a.G", "a.B", "b.R", "b.G", "b.B"], np.float32)[0])
     assert refused(tmp_path / "a.exr") == "has the layers a, b; save the one of the image alone"
@@ -503,12 +513,13 @@ def test_a_profile_of_16_bits_is_refused_unless_values_are_linear(tmp_path):
     assert read_image(tmp_path / "a.png", "linear")[0, 0, 2] == np.float32(300 / 65535)
 
 
-def test_clipped_and_transparent_pixels_of_a_profile_stay_marked(tmp_path):
+@pytest.mark.parametrize("space", ["Display P3", "SMPTE C"])  # a wider and a narrower gamut than sRGB
+def test_clipped_and_transparent_pixels_of_a_profile_stay_marked(space, tmp_path):
     from PIL import Image
 
     values = np.full((2, 2, 4), 100, np.uint8)
-    values[0, 0, 1], values[1, 1, 3] = 255, 0
-    Image.fromarray(values).save(tmp_path / "a.png", icc_profile=profile_of("Display P3", 2.2))
+    values[0, 0, 0], values[1, 1, 3] = 255, 0
+    Image.fromarray(values).save(tmp_path / "a.png", icc_profile=profile_of(space, 2.2))
     photo = read_photo(tmp_path / "a.png")
     assert (np.argwhere(photo.clipped).tolist(), np.argwhere(photo.transparent).tolist()) == ([[0, 0]], [[1, 1]])
 
