@@ -22,7 +22,7 @@ from reslrb_cli.measure.missing import LineSegment, Missing, Tracing, _Short, me
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.measurements import ALARM, MissingRecord
+from reslrb_cli.records.measurements import ALARM, MissingRecord, student
 from reslrb_cli.report.run_summary import find_remedy, warnings
 
 #: A box on a floor under an area lamp, seen from above. Runs recover the box's place from an image that `path`
@@ -232,6 +232,38 @@ def simulated(directions: int, share: float, whole: float, noise: float, count: 
         short.tracing = Simulated([], None, None, 1)
         found.append(short.measured("x", 400.0 * directions))
     return found
+
+
+def test_all_looks_together_keep_the_probability_of_a_false_alarm():
+    """The samples have a mean of 0. Each look at growing numbers of them may find them significant."""
+    sums = np.random.default_rng(3).normal(size=(4000, missing.MOST_SEEDS)).cumsum(1)
+    squares = np.square(np.diff(sums, axis=1, prepend=0)).cumsum(1)
+    alarms, look = np.zeros(len(sums), bool), missing.FEWEST
+    while look <= missing.MOST_SEEDS:
+        mean = sums[:, look - 1] / look
+        error = np.sqrt((squares[:, look - 1] / look - mean**2) / (look - 1))
+        alarms |= np.abs(mean) > student(look, 1) * error
+        look *= missing.GROWTH
+    assert 0.2 * ALARM < alarms.mean() <= stats.binom.ppf(0.99, len(sums), ALARM) / len(sums)
+
+
+def test_weights_belong_to_the_end_with_the_higher_loss(llvm: str):
+    """There, the derivative of the loss does not vanish, whichever end is nearer to the target at -1."""
+
+    class Along(Tracing):
+        def move(self, vector: np.ndarray, s: float) -> None:
+            self.at = s
+
+    case: Any = SimpleNamespace(weights=np.zeros((1, 1, 1)))
+    view: Any = SimpleNamespace(
+        sensor=0, share=1.0, follow=lambda scene: None, compare=lambda image: [np.square(np.array(image) + 1).sum()]
+    )
+    along = Along([case], None, None, 1)
+    problem: Any = SimpleNamespace(
+        scene=None, render=lambda *_: np.full((1, 1, 1), along.at), image_gradient=lambda _, image: 2 * (image + 1)
+    )
+    segment = LineSegment(np.ones(1), -1, 0.5)
+    assert along.weigh(segment, problem, [view], 1).weights == [np.ones((1, 1, 1))]
 
 
 @pytest.mark.parametrize(("directions", "noise"), [(1, 0.25), (3, 0.3)])
