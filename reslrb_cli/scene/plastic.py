@@ -35,7 +35,7 @@ Array = np.ndarray[Any, Any]
 #: Parameters on which the tables depend, and the largest step of their differences. A step is at most a tenth of alpha,
 #: or an eighth of the distance of eta from 1. Mitsuba adds up thousands of numbers in single precision, so shorter
 #: steps have larger errors.
-_STEPS = {"alpha": 0.02, "eta": 0.03}
+_STEPS = {"alpha": 0.008, "eta": 0.015}
 
 
 @dataclass
