@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 from pathlib import Path
@@ -11,11 +12,13 @@ from typing import Any
 
 import benchmarks_measure
 import benchmarks_page as pages
+import click
 import pytest
 from benchmarks_measure import MEASUREMENTS, OTHERS, PAPER, RECORDS, ROOT, record_file
 from benchmarks_page import main, read
 
 from paper import page as paper_page
+from reslrb_cli.cli import main as program
 from reslrb_cli.measure.extreme import CASES
 
 TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "1", "--set", "scene.options.size=8",
@@ -167,6 +170,45 @@ def test_files_named_in_text_exist() -> None:
     assert gone == []
     text = "`walk/x.py`, scripts/a (tests/b.py)"
     assert NAMED.findall(text) == ["walk/x.py", "scripts/a", "tests/b.py"]
+
+
+#: Command lines of the documentation: blocks have whole ones, and text may leave out arguments.
+BLOCK, IN_TEXT = re.compile(r"^ {4,}reslrb ((?:.*\\\n)*.*)$", re.MULTILINE), re.compile(r"`reslrb ([a-z][^`]*)`")
+
+
+def wrong_command(line: str, is_whole: bool) -> str:
+    """Return a command line of the documentation with its error, or an empty text. Files and values are not checked."""
+    words = [word for word in shlex.split(line.replace("\\\n", " "), comments=True) if word not in ("...", "--debug")]
+    words = words[: next((place for place, word in enumerate(words) if word in ("|", "&&", ">")), None)]
+    name, *rest = words or ["--help"]
+    if name.startswith("-"):
+        return ""
+    command = program.get_command(click.Context(program), name)
+    if command is None:
+        return f"{line}: no such command"
+    try:
+        command.make_context(name, rest)
+    except click.UsageError as error:
+        lacks = isinstance(error, click.MissingParameter) or "requires an argument" in error.message
+        if is_whole if lacks else not isinstance(error, click.BadParameter):
+            return f"{line}: {error.format_message()}"
+    except click.exceptions.Exit:  # --help
+        pass
+    return ""
+
+
+def test_commands_of_the_documentation_are_accepted() -> None:
+    wrong, checked = [], 0
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        for pattern in (BLOCK, IN_TEXT):
+            for line in pattern.findall(page.read_text(encoding="utf-8")):
+                checked += 1
+                if error := wrong_command(line, is_whole=pattern is BLOCK):
+                    wrong.append(f"{page.name}: {error}")
+    assert wrong == []
+    assert checked > 200
+    assert wrong_command("render a.yaml", is_whole=True).endswith("Missing option '-o' / '--output'.")
+    assert "No such option" in wrong_command("report --colour", is_whole=False)
 
 
 @pytest.fixture
