@@ -97,6 +97,14 @@ def test_a_black_and_white_picture_becomes_a_lens(
     assert seen.min() == 0
 
 
+def test_transparent_parts_of_a_picture_of_floats_are_white(tmp_path: Path) -> None:
+    """Files of floats store colours that are multiplied by alpha."""
+    alpha = np.array([[0.0, 0.5], [0.75, 1.0]], np.float32)
+    pixels = np.stack([0.2 * alpha] * 3 + [alpha], axis=-1)
+    mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA).write(str(tmp_path / "p.exr"))
+    assert read_luminance(tmp_path / "p.exr") == pytest.approx(0.2 * alpha + 1 - alpha, rel=1e-3)
+
+
 def test_a_pattern_finer_than_the_pixels_is_named(tmp_path: Path) -> None:
     Image.fromarray((255 * (np.indices((64, 64)).sum(axis=0) % 2)).astype(np.uint8)).save(tmp_path / "p.png")
     result = CliRunner().invoke(command, [str(tmp_path / "p.png"), "-o", str(tmp_path / "lens"), "--pixels", "32"])

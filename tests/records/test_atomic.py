@@ -17,6 +17,7 @@ from reslrb_cli.records import checkpoint
 from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinished_folder, write_atomically
 from reslrb_cli.records.checkpoint import newest_checkpoint, read_state, save_checkpoint
 from reslrb_cli.records.images import MOST_BYTES, file_stem
+from reslrb_cli.records.measurement_files import Origin, write_lines
 
 # Files are whole or absent, and unfinished files are removed.
 
@@ -67,6 +68,19 @@ def test_a_process_that_exits_at_once_can_tidy_up(tmp_path: Path) -> None:
 
     with pytest.raises(FileNotFoundError):
         write_atomically(tmp_path / "file", leave)
+
+
+def test_a_file_of_json_is_written_through_a_link(tmp_path: Path) -> None:
+    """A link may lead to another disk. It stays a link."""
+    target, link = tmp_path / "target", tmp_path / "link"
+    for content in ("", "earlier\n"):
+        link.unlink(missing_ok=True)
+        target.write_text(content)
+        link.symlink_to("target")
+        write_lines(link, [Origin("cpu", "llvm_ad_rgb")])
+        assert link.is_symlink()
+        assert target.read_text().count("\n") == 1
+        assert "llvm_ad_rgb" in target.read_text()
 
 
 def test_an_unfinished_folder_stays_if_it_gets_a_name(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import os
+import pickle
 import random
 import signal
 import sys
@@ -187,6 +188,20 @@ def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
         calls.perform(workload.key, b"", fail, ())
     assert [text.partition(" failed: ")[0] for text in me.reasons] == ["worker 1 (here)"] * 2
     assert me.reasons[1].endswith("No space left on device; it is restarted")
+
+
+class _Broken:
+    """Context of calls that cannot be taken."""
+
+    def take(self, state: object) -> None:
+        raise ValueError("broken")
+
+
+def test_a_context_that_was_not_taken_is_taken_again(me: SimpleNamespace) -> None:
+    me.plugins["reslrb"] = workload = calls.Workload({"a": b"one"}, reads)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="broken"):
+            calls.perform(workload.key, pickle.dumps(_Broken()), str.upper, ())
 
 
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
@@ -443,7 +458,7 @@ BAD = [
 ]
 
 
-@pytest.mark.long  # in this process: test_everything_of_a_cluster_is_in_one_folder
+@pytest.mark.long  # in this process: test_a_cluster_has_one_folder_and_one_memory
 def test_two_signals_leave_no_files(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second signal ends the process at once. The workers then end by themselves."""
     place = made(experiment / "temporary")
@@ -459,12 +474,15 @@ def test_two_signals_leave_no_files(experiment: Path, monkeypatch: pytest.Monkey
     assert list(place.iterdir()) == []
 
 
-def test_everything_of_a_cluster_is_in_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that ends at once removes this folder."""
+def test_a_cluster_has_one_folder_and_one_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that ends at once removes this folder. The workers share the free memory of this machine."""
     place = made(tmp_path / "temporary")
     monkeypatch.setattr(tempfile, "tempdir", str(place))
-    with connected(Cluster(1)) as (client, folder):
-        client.wait_for_workers(1, timeout=60)
+    monkeypatch.setattr("reslrb_cli.backend.doctor.free_bytes", lambda variant: 12 * 2**30)
+    with connected(Cluster(2)) as (client, folder):
+        client.wait_for_workers(2, timeout=60)
+        workers = client.scheduler_info(n_workers=-1)["workers"].values()
+        assert [worker["memory_limit"] for worker in workers] == [6 * 2**30] * 2
         assert list(place.iterdir()) == [folder]
         assert folder in atomic.unfinished
     assert folder not in atomic.unfinished
