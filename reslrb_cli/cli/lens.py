@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, has_room
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.glasses import find_glass
 from reslrb_cli.records.atomic import write_atomically, writing
@@ -118,12 +118,13 @@ SECONDS_PER_LINE = 5.0
 
 @contextmanager
 def show_stages(count: int) -> Iterator[Callable[[str], None]]:
-    """Show on standard error which of about `count` stages runs: by a bar on a terminal, otherwise by lines. Yields a
+    """Show on standard error which of about `count` stages runs: by a bar on a terminal that has a width,
+    otherwise by lines. Yields a
     function that takes the name of the stage that begins.
     """
     stream, begun, last = sys.stderr, 0, time.monotonic()
     bar: Any = None
-    if stream is not None and stream.isatty():
+    if stream is not None and has_room(stream):
         from tqdm import tqdm
 
         form = "{percentage:3.0f}%|{bar}| {desc}, {elapsed}"

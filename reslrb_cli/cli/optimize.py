@@ -13,7 +13,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -24,7 +24,7 @@ from reslrb_cli.cli.options import (
     optional_experiment_arguments,
     start_variant,
 )
-from reslrb_cli.cli.terminal import echo
+from reslrb_cli.cli.terminal import echo, has_room
 from reslrb_cli.cluster.connection import Cluster
 from reslrb_cli.errors import ConfigError, ExitCode
 
@@ -217,16 +217,6 @@ BAR, BAR_COLUMNS = "{percentage:3.0f}%|{bar}| {desc}, {n_fmt}/{total_fmt}{postfi
 RECENT = 64
 
 
-def _columns(stream: TextIO) -> int:
-    """Return the width of a terminal. It is 0 on some terminals of containers and scripts. Return 1 if the width is
-    unknown.
-    """
-    try:
-        return os.get_terminal_size(stream.fileno()).columns
-    except (OSError, ValueError):
-        return 1
-
-
 class Progress:
     """Progress of a run with `total` iterations on standard error: a bar on a terminal that has a width, plain lines
     otherwise.
@@ -246,7 +236,7 @@ class Progress:
         self._before_s = 0.0  # `elapsed_s` before these records
         self._bar: Any = None
         self._last_line, self._tenth = time.monotonic(), 10 * done // total
-        if not self._quiet and self._stream.isatty() and _columns(self._stream) > 0:
+        if not self._quiet and has_room(self._stream):
             from tqdm import tqdm
 
             self._bar = tqdm(

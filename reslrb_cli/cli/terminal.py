@@ -28,7 +28,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import click
 
@@ -157,6 +157,18 @@ def fill(template: str, filters: Mapping[str, Callable[..., object]], **values: 
     )  # fmt: skip
     made.filters.update(filters)
     return made.get_template(template).render(values)
+
+
+def has_room(stream: TextIO) -> bool:
+    """Whether a stream is a terminal with room for a progress bar. Some terminals of containers and scripts have a
+    width of 0.
+    """
+    if not stream.isatty():
+        return False
+    try:
+        return os.get_terminal_size(stream.fileno()).columns > 0
+    except (OSError, ValueError):  # the width is unknown
+        return True
 
 
 class LogLines(logging.Handler):

@@ -15,6 +15,7 @@ import re
 import struct
 import sys
 import termios
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ from cli.test_nonfinite import CONFIG, SCENE
 from cli.tiny import outcome
 from records.test_metrics import make_record
 
+from reslrb_cli.cli import lens
+from reslrb_cli.cli.lens import show_stages
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import LogLines
 from reslrb_cli.optimization.problem import ErrorMeter
@@ -132,22 +135,35 @@ def test_losing_the_terminal_does_not_end_a_run(monkeypatch: pytest.MonkeyPatch)
             progress.show(record(9, 1))
 
 
+def show_iterations() -> None:
+    with Progress(10, quiet=False, meter=make_meter(1)) as progress:
+        for number in range(10):
+            progress.show(record(number, 1))
+
+
+def show_a_stage() -> None:
+    with show_stages(2) as tell:
+        tell("the solid")
+
+
+@pytest.mark.parametrize(("show", "line"), [(show_iterations, "10/10: loss"), (show_a_stage, "the solid ...")])
 @pytest.mark.parametrize("columns", [0, 1, 80])
-def test_progress_is_shown_on_terminals_of_any_size(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_shown_on_terminals_of_any_size(
+    columns: int, show: Callable[[], None], line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Terminals of containers and scripts may have no size, so that a bar has no room."""
+    monkeypatch.setattr(lens, "SECONDS_PER_LINE", 0.0)
     ours, theirs = os.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 0 if columns == 0 else 24, columns, 0, 0))
     with os.fdopen(theirs, "w") as stream:
         monkeypatch.setattr(sys, "stderr", stream)
-        with Progress(10, quiet=False, meter=make_meter(1)) as progress:
-            for number in range(10):
-                progress.show(record(number, 1))
+        show()
     shown = ""
     with contextlib.suppress(OSError):  # the end of the terminal
         while part := os.read(ours, 10_000):
             shown += part.decode()
     os.close(ours)
-    assert ("10/10: loss" in shown) == (columns == 0)
+    assert (line in shown) == (columns == 0)
     assert shown.strip()
 
 
