@@ -122,7 +122,7 @@ def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[C
             echo(table.line(method_cells(record)))
         for line in [*map(reference_line, results.references), *notes(results.methods)]:
             echo(line)
-        echo(closing_sentence(results.methods))
+        echo(closing_sentence(results.methods, results.references))
         return results, interrupts.requested
 
 

@@ -227,17 +227,18 @@ def reference_line(record: ReferenceRecord) -> str:
 
 def result_lines(results: ConvergenceResults) -> list[Line]:
     """Return all records of a convergence, including the closing sentence."""
-    summary = SummaryRecord(closing_sentence(results.methods))
+    summary = SummaryRecord(closing_sentence(results.methods, results.references))
     return [*results.points, *results.methods, *results.references, summary]
 
 
-def closing_sentence(records: Sequence[MethodRecord]) -> str:
+def closing_sentence(records: Sequence[MethodRecord], references: Sequence[ReferenceRecord] = ()) -> str:
     """Return a sentence that names the best method for this scene, and its lead. The last record is that of all
     parameters together, the only parameter, or the image.
 
     A biased method is always called biased. A lead counts only if the interval of the efficiency ratio lies above 1.
     The intervals of all pairs of methods hold together with a probability of 95 % (Bonferroni): the best of many
-    equal methods leads by chance.
+    equal methods leads by chance. If the references of errors and of biases differ, either may be wrong, and so may
+    the biases that were found.
     """
     together = [r for r in records if r.parameter == records[-1].parameter and r.efficiency is not None]
     if not together:
@@ -265,6 +266,10 @@ def closing_sentence(records: Sequence[MethodRecord]) -> str:
         first, times = biased[0], _efficiency(biased[0]) / _efficiency(best)
         sentence += f" The biased {first.method.label} has {number(times, 2)} times its efficiency"
         sentence += f", but its error stays above {first.bias:.2g}." if first.bias else "."
+    wrong = next((record for record in references if record.biased), None)
+    if biased and wrong is not None:
+        sentence += f" {wrong.method.label} and {wrong.bias_reference} differ, so either of them may be biased, and the"
+        sentence += " methods that agree with it: `reslrb gradcheck` compares them with other references."
     return sentence
 
 

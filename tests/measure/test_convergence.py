@@ -114,6 +114,10 @@ def test_references_of_errors_are_checked_too(tmp_path: Path) -> None:
     event = of(results, "reslrb:event", "a")
     assert event.biased is True
     assert event.bias == pytest.approx(0.1, rel=0.2)  # against ptracer, not against the biased reference
+    words = " differ, so either of them may be biased"
+    assert words in closing_sentence(results.methods, results.references)
+    agreed = [replace(record, biased=False) for record in results.references]
+    assert words not in closing_sentence(results.methods, agreed)
 
 
 def test_a_missing_independent_reference_is_reported(tmp_path: Path) -> None:
