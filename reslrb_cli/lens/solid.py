@@ -407,8 +407,10 @@ def summary(numbers: dict[str, Any]) -> list[str]:
         radius, slope = face["smallest_concave_radius"], face["steepest_slope_degrees"]
         hollow = "nowhere hollow" if radius is None else f"hollows with radii from {radius:.3g} mm"
         ball = face["cutter"]["largest_radius"]
-        fits = "any ball cutter" if ball is None else f"ball cutter with a radius up to {ball:.3g} mm"
-        lines.append(f"{name}: {face['relief']:.3g} mm deep, slopes up to {slope:.3g} degrees, {hollow}; {fits}")
+        fits = "any" if ball is None else f"with a radius up to {ball:.3g} mm, for 99 % of the face"
+        lines.append(
+            f"{name}: {face['relief']:.3g} mm deep, slopes up to {slope:.3g} degrees, {hollow}; ball cutter: {fits}"
+        )
     return lines + numbers["warnings"]
 
 

@@ -12,7 +12,7 @@ from lens.test_experiment import picture
 from turns import a_few
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.lens.solid import SCALLOP, cutter, stepover
+from reslrb_cli.lens.solid import SCALLOP, cutter, stepover, summary
 from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import luminance, write_file
 from reslrb_cli.report.page.workshop import material, setup_facts
@@ -32,6 +32,10 @@ def test_the_largest_ball_fits_into_all_hollows_but_the_sharpest_hundredth() -> 
     assert found["stepover"] == pytest.approx(stepover(10.0))
     assert cutter(np.concatenate([curvature, np.full(20, 5.0)]))["largest_radius"] == pytest.approx(0.2)
     assert cutter(np.full(9, -0.1))["largest_radius"] is None
+    face = {"smallest_concave_radius": 0.2, "steepest_slope_degrees": 9.0, "relief": 4.0, "cutter": found}
+    [_, line] = summary({"extent": (9.0, 9.0, 9.0), "volume_mm3": 9.0, "least_thickness": 9.0, "triangles": 9,
+                         "faces": {"face": face}, "warnings": []})  # fmt: skip
+    assert line.endswith("hollows with radii from 0.2 mm; ball cutter: with a radius up to 10 mm, for 99 % of the face")
 
 
 def test_an_error_is_allowed_until_ssim_has_fallen_by_a_twentieth() -> None:
