@@ -197,7 +197,7 @@ def _from_file(slot: ParameterValue, current: Array, image_file: Any, any_size: 
     except ConfigError as error:
         raise place.fail("initial.file", f"{path}: {error.message}") from None
     if not any_size and image.shape[:2] != current.shape[:2]:
-        message = f"{path} is {_size(image)}, the texture {_size(current)}; {_RESAMPLE}"
+        message = f"{path} is {_size(image)}, the texture {_size(current)}; {_resample_hint(place)}"
         raise place.fail("initial.file", message)
     if slot.channels == 1:
         if (image != image[..., :1]).any():
@@ -217,14 +217,16 @@ def _from_run(slot: ParameterValue, current: Array, run: Path, any_size: bool, p
     if array.shape == current.shape or (is_like and any_size):
         return np.asarray(array, dtype=np.float32)
     if is_like:
-        has = f"with {_size(array)} texels, the texture has {_size(current)}; {_RESAMPLE}"
+        has = f"with {_size(array)} texels, the texture has {_size(current)}; {_resample_hint(place)}"
     else:
         shapes = ["x".join(map(str, value.shape)) or "one number" for value in (array, current)]
         has = f"of shape {shapes[0]}, but in the scene of shape {shapes[1]}"
     raise place.fail("initial.run", f"{run} has `{slot.key}` {has}")
 
 
-_RESAMPLE = "give `resolution: [width, height]` to resample"
+def _resample_hint(place: Place) -> str:
+    has_options = place.at("resolution") != ""
+    return "give `resolution: [width, height]` to resample" if has_options else "use an image of this size"
 
 
 def _size(image: Array) -> str:

@@ -161,6 +161,7 @@ def test_a_run_is_relit_with_its_recovered_values(
     lamp = read_value(run, LAMP)
     brighter = rendered(run, *spp, "--value", f"{LAMP}={(2 * lamp).tolist()}")
     np.testing.assert_allclose(brighter, 2 * recovered_values, rtol=1e-4)
+    tiny.write_photo(tmp_path / "w.png", np.full((4, 5, 3), 0.4, np.float32))
     white = rendered(run, *spp, "--value", "poster.reflectance.*=0.9", "--value", "wall.translation=[0, 0, 0]")
     assert white.mean() > 1.1 * recovered_values.mean()
     for words, line in (
@@ -175,6 +176,8 @@ def test_a_run_is_relit_with_its_recovered_values(
         (["--value", "4"], "--value 4: must be KEY=VALUE, such as"),
         (["--value", f"{LAMP}=4", "--value", f"{LAMP}=5"], f"--value {LAMP}=5: is given twice"),
         (["--value", f"{LAMP}=[1, 2]"], f"--value: {LAMP}: is of shape (2,); it must have the parameter's shape (3,)"),
+        (["--value", f"{tiny.KEY}={{file: w.png}}"], f"--value: {tiny.KEY}: {tmp_path}/w.png is 5x4, the texture "
+         "4x4; use an image of this size"),
         (["--value", "wall.to_world=0"], "--value: wall.to_world: `wall.to_world` is recovered as a motion"),
     ):  # fmt: skip
         result = reslrb("render", run, *words, "-o", "x.exr")
@@ -288,6 +291,9 @@ def test_an_exported_scene_names_path_if_ptracer_is_wrong(tmp_path: Path) -> Non
     integrator, why = choose_integrator(config, scene, mi.traverse(scene), "light")
     assert integrator == {"type": "path", "max_depth": 3, "rr_depth": 5, "hide_emitters": False}
     assert why == ", since ptracer has wrong emission from a rotated environment map"
+    own = load(tmp_path / "tiny.yaml", ["integrator={type: ptracer}"])  # its users have accepted its errors
+    integrator, why = choose_integrator(own, scene, mi.traverse(scene), "light")
+    assert (integrator["type"], why) == ("ptracer", "")
     by_prb = load(tmp_path / "tiny.yaml", ["integrator={type: prb, max_depth: 4}"])
     integrator, why = choose_integrator(by_prb, scene, mi.traverse(scene), "camera")
     assert (integrator["type"], integrator["max_depth"], why) == ("path", 4, "")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.references import Situation, path_image, ptracer_image
 from reslrb_cli.measure.scenes.small import bitmap, camera, diffuse, rgb, room, texture, transform
 from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.transport.lamps import beam_towards
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -26,13 +28,16 @@ TEXELS = "lamp.emitter.radiance.data"
 PLACE = {"translate": [0.2, 0.1, 0.3], "rotate": ([1, 2, 3], 40), "scale": 0.35}
 
 
-def sheets(first: list[tuple[float, float]], second: list[tuple[float, float]] | None) -> Any:
-    """Return a mesh of two triangles, one above the other, with these texture coordinates of their corners."""
+Corners = list[tuple[float, float]]
+
+
+def sheets(first: Corners, second: Corners | None, emitter: str = "area", aside: float = 0) -> Any:
+    """Return a mesh of two triangles, one above the other and `aside`. Corners have these texture coordinates."""
     uv = [] if second is None else [*first, *second]
-    mesh = mi.Mesh("sheets", 6, 2, has_vertex_texcoords=bool(uv), props=_lamp(texture(2, 2, 0.2, 3)))
+    mesh = mi.Mesh("sheets", 6, 2, has_vertex_texcoords=bool(uv), props=_lamp(emitter, texture(2, 2, 0.2, 3)))
     params = mi.traverse(mesh)
     corners = np.array([[0, 0, 0], [0.8, 0, 0], [0, 0, 0.8]])
-    params["vertex_positions"] = np.concatenate([corners, np.add(corners, [0, 0.4, 0])]).ravel()
+    params["vertex_positions"] = np.concatenate([corners, np.add(corners, [aside, 0.4, 0])]).ravel()
     params["faces"] = np.arange(6)
     if uv:
         params["vertex_texcoords"] = np.ravel(uv)
@@ -40,10 +45,10 @@ def sheets(first: list[tuple[float, float]], second: list[tuple[float, float]] |
     return mesh
 
 
-def _lamp(radiance: dict[str, Any]) -> Any:
+def _lamp(emitter: str, radiance: dict[str, Any]) -> Any:
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(diffuse(0, 0, 0))
-    properties["mesh_emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
+    properties["mesh_emitter"] = mi.load_dict({"type": emitter, "radiance": radiance})
     return properties
 
 
@@ -61,6 +66,40 @@ def test_shared_coordinates_are_found(second: Any, shares: bool):
     [lamp] = SceneGraph.of(scene).find_lamps(scene)
     assert lamp.shared == shares
     assert (lamp.texture is None) == shares
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "disk", "mesh", "flipped"])
+def test_parallel_light_comes_from_the_point_that_a_ray_meets(kind: str):
+    """The ray leaves a point against the direction of the light. Some points are beside or behind the lamp."""
+    if kind == "mesh":
+        shape = sheets(LEFT, RIGHT, "directionalarea", 0.9)
+    else:
+        emitter = {"type": "directionalarea", "radiance": texture(3, 5, 0.2, 3)}
+        place = transform(translate=[0.2, 0.1, 0.3], rotate=([1, 2, 3], 40), scale=[0.3, 0.6, 0.4])
+        name, flips = ("rectangle", True) if kind == "flipped" else (kind, False)
+        shape = {"type": name, "to_world": place, "flip_normals": flips, "emitter": emitter}
+    scene = mi.load_dict({"type": "scene", "lamp": shape}, optimize=False)
+    [lamp] = SceneGraph.of(scene).find_lamps(scene)
+    assert lamp.is_beam
+    count = 1000
+    numbers = mi.PCG32(count)
+    there = lamp.shape.sample_position(0, mi.Point2f(numbers.next_float32(), numbers.next_float32()))
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    aside = mi.Vector3f(*(0.3 * numbers.next_float32() - 0.15 for _ in range(3)))
+    si.p = there.p + there.n * (numbers.next_float32() - 0.2) + dr.cross(there.n, aside)
+    met = scene.ray_intersect(mi.Ray3f(si.p, -there.n))
+    expected = dr.select(met.is_valid(), lamp.radiance.eval(met), 0)
+    dr.eval(si, met, expected)
+    light, places = np.zeros((3, count)), np.zeros(count, dtype=bool)
+    for number in (0.25, 0.75):  # selects the face of a mesh
+        ds, weight = beam_towards(lamp, si, mi.Float(number), mi.Bool(True))
+        light += 0.5 * np.array(weight)
+        same = np.linalg.norm(np.array(ds.p) - np.array(met.p), axis=0) < 1e-5
+        places |= (np.array(ds.pdf) > 0) & same & (abs(np.array(ds.dist) - np.array(met.t)) < 1e-5)
+    inside = np.array(met.is_valid())
+    assert 0.2 < inside.mean() < 0.9
+    assert np.array_equal(places, inside)
+    np.testing.assert_allclose(light, np.array(expected), atol=1e-5)
 
 
 def lit(kind: str, radiance: dict[str, Any]) -> Case:

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from cli.tiny import ROOT
 from compilation import search_path
@@ -23,7 +24,7 @@ from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records.decisions import CACHE_FILE, MOST, Decision, DecisionCache, cache_folder, key_of
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
-from reslrb_cli.records.run_folder import RunFolder, check_output, link_latest, opened
+from reslrb_cli.records.run_folder import RunFolder, check_output, exposed, link_latest, opened
 
 # Run folders: their names, and that no half-made folder remains.
 
@@ -313,6 +314,12 @@ def test_an_unwritable_place_is_no_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     DecisionCache(tmp_path / "file" / "deeper").put("a", made(1))
     assert DecisionCache(tmp_path / "file" / "deeper").get("a") is None
+
+
+@pytest.mark.parametrize("exposure", [2.0, np.array([2, 3, 4], np.float32)])
+def test_an_exposure_scales_the_colours_only(exposure: Any) -> None:
+    image = exposed(np.ones((2, 2, 5), np.float32), exposure, 3)
+    assert (image == np.append(np.broadcast_to(exposure, 3), [1, 1])).all()
 
 
 def test_location(monkeypatch: pytest.MonkeyPatch) -> None:
