@@ -145,7 +145,8 @@ _RATIO = 0.01
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="Configuration to write. Default: the scene's name with .yaml, in the working directory.",
+    help="Configuration to write. Default: the name of the scene's file, or of its folder if the file is scene.xml, "
+    "with .yaml, in the working directory.",
 )
 @click.option(
     "--sensor",
