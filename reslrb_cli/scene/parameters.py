@@ -368,10 +368,9 @@ def matching_keys(params: mi.SceneParameters, pattern: str, place: Place, names:
     is_key = pattern in params.properties
     matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
-        near = difflib.get_close_matches(pattern, [*names, *params.properties], n=3, cutoff=0.5)
-        if not near:
-            recoverable = [info.key for info in list_parameters(params) if _obstacle(info) is None]
-            near = difflib.get_close_matches(pattern, recoverable, n=3, cutoff=0)
+        recoverable = [info.key for info in list_parameters(params) if _obstacle(info) is None]
+        near = difflib.get_close_matches(pattern, [*names, *recoverable], n=3, cutoff=0.5)
+        near = near or difflib.get_close_matches(pattern, recoverable, n=3, cutoff=0)
         hint = " or ".join(f"`{key}`" for key in near)
         id, _, word = pattern.rpartition(".")
         if word in (*WORDS, HEIGHTMAP) and isinstance(find_movable(params, id), Movable):

@@ -128,6 +128,11 @@ def test_bounds_hold_for_the_nearest_float(make_scene):
     ("specs", "where", "what"),
     [
         ([{"key": "flor.reflectance.data"}], "key", f"matches no parameter of the scene; did you mean `{TEXTURE}`"),
+        (
+            [{"key": "lamp.sampling"}],
+            "key",
+            "did you mean `lamp.position`?",
+        ),  # `lamp.sampling_weight` cannot be recovered
         ([{"key": "zzz*"}], "key", "matches no parameter"),
         ([{"key": "plane.to_world"}], "key", "is recovered as a motion"),
         ([{"key": "camera.x_fov"}], "key", "belongs to the sensor"),
