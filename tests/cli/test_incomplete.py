@@ -352,6 +352,24 @@ def test_consequences_of_a_share(found: MissingRecord, incomplete: bool, refused
     assert ("detect no missing part" in found.line()) is (found.share == 0.1)
 
 
+@pytest.mark.parametrize(
+    ("without", "with_edges", "reduced"),
+    [
+        (record(0.3, 0.03), record(0.24, 0.03), False),  # twice the error of a difference is 0.085
+        (record(0.3, 0.03), record(0.26, 0.001), False),
+        (record(0.3, 0.03), record(0.2, 0.03), True),
+        (record(0.2, 0.03), record(0.3, 0.03), False),
+        (record(0.3, 0.03), record(None, None), True),
+        (record(None, None), record(0.2, 0.03), True),
+        (record(0.3, 0.03), None, True),
+    ],
+)
+def test_edges_stay_on_if_they_may_reduce_the_share(
+    without: MissingRecord, with_edges: MissingRecord | None, reduced: bool
+):
+    assert without.is_reduced_to(with_edges) is reduced
+
+
 def test_a_rising_loss_is_explained_by_the_missing_part():
     """The program then proposes no lower rate, not even for other parameters that still move."""
     level = {"start": {"mean": 1.0, "error": 0.01}, "end": {"mean": 2.0, "error": 0.01}, "change": "rose"}

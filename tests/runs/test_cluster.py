@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -188,6 +188,30 @@ def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
         calls.perform(workload.key, b"", fail, ())
     assert [text.partition(" failed: ")[0] for text in me.reasons] == ["worker 1 (here)"] * 2
     assert me.reasons[1].endswith("No space left on device; it is restarted")
+
+
+def test_calls_have_more_time_than_the_longest_one(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[float] = []
+
+    @contextmanager
+    def guarded(worker: object, seconds: float) -> Iterator[None]:
+        limits.append(seconds)
+        yield
+
+    monkeypatch.setattr(calls, "_guarded", guarded)
+    me.plugins["reslrb"] = workload = calls.Workload({}, lambda folder, threads: ("one", {"upper": 2.0}))
+    for function in (str.upper, str.lower):
+        calls.perform(workload.key, b"", function, ())
+    loading_s, known_s, cold_s = limits
+    assert (loading_s, cold_s) == (calls.COLD_S, calls.COLD_S)
+    assert calls.CALL_S + 10 * 2.0 <= known_s < calls.CALL_S + 10 * 2.0 + 5
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(1, 6), (4, 1), (7, 1)])
+def test_workers_share_the_cores(workers: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)))
+    assert Cluster(workers).threads == threads
+    assert Cluster(address="tls://there:1").threads is None
 
 
 class _Broken:
