@@ -17,7 +17,6 @@ from typing import Any, ClassVar, Literal, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from reslrb_cli.records.metrics import Line, finite
-from reslrb_cli.statistics import special
 
 
 class BenchStatus(str, enum.Enum):
@@ -370,6 +369,8 @@ def student(seeds: int, directions: int) -> float:
     """Return how many standard errors make a mean over `seeds` samples significant (Student's t). The limit accounts
     for all looks and all directions (Bonferroni).
     """
+    from reslrb_cli.statistics import special  # late, because it imports NumPy, and `--help` reads these records
+
     return float(special().stdtrit(seeds - 1, 1 - ALARM / (2 * LOOKS * directions)))
 
 

@@ -131,8 +131,8 @@ def test_finished_work_is_kept(spoilt_experiment, monkeypatch):
 
     def sometimes(image, target, weights=None):
         calls.append(1)
-        # The first call is for the saved initial image, and the third for a black image.
-        return root_of_pixel(image, target) if len(calls) == 4 else losses.l2(image, target)
+        # The first call is for the saved initial image, and the third and fourth for a black image and the target.
+        return root_of_pixel(image, target) if len(calls) == 5 else losses.l2(image, target)
 
     monkeypatch.setitem(losses.LOSSES, "l2", sometimes)
     _, err = optimize(STOP)

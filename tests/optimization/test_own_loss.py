@@ -141,7 +141,7 @@ def test_a_run_is_read_without_its_code_and_continues_only_with_the_same(
     (experiment / "own.py").write_text(OWN + "# another\n")
     assert optimize(*more, "--allow-code") == 2
     err = capsys.readouterr().err
-    assert "loss.file: has changed since runs/a began" in err
+    assert "own.py has changed since runs/a began" in err
     (experiment / "own.py").write_text(OWN)
     assert optimize(*more, "--allow-code") == 0
     assert len(read_metrics("runs/a")) == 4
