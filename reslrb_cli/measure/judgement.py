@@ -376,6 +376,8 @@ class Judgement:
         status = BenchStatus.OK if member.end is None else member.end.status
         if not self._has_figures(member, key):
             reason = member.message or ("" if member.end is None else member.end.reason)
+            if (rounds := self._session.plan.rounds) is not None and rounds < FEWEST:
+                reason = reason or f"results need {FEWEST} rounds; set --rounds"
             reason = reason or ("the budget was spent" if member.late or not self._measured(member) else _UNSEEN)
             return MethodRecord(
                 member.method, key, status, repeats=len(member.rows), cold_s=member.cold_s, message=reason

@@ -113,6 +113,8 @@ class NamedIntegrator:
         for option, fixed in {"estimator": AUTO_ESTIMATOR, **PLAIN}.items():
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
+        if not auto:
+            config = _with_all_lamps(config)
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
         if getattr(made.integrator, "file", None) is not None and not config.allows_code:
             raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
@@ -204,6 +206,20 @@ def all_estimators(config: Config) -> list[NamedIntegrator]:
     if isinstance(own, ReslrbConfig) and own.paths == "auto":
         cases.append(NamedIntegrator("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
     return cases
+
+
+def _with_all_lamps(config: Config) -> Config:
+    """Return the experiment with its first view alone and all lamps on, if views name their lamps. Stock integrators
+    cannot switch lamps off.
+    """
+    if config.views is None or all(view.lamps is None for view in config.views):
+        return config
+    return config.model_copy(
+        update={
+            "views": [config.views[0].model_copy(update={"lamps": None})],
+            "run": config.run.model_copy(update={"held_out": [], "views_per_iteration": None}),
+        }
+    )
 
 
 def _split(text: str) -> list[str]:

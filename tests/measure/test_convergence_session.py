@@ -82,6 +82,11 @@ def test_an_ended_method_is_recorded_and_the_rest_continues(tmp_path: Path) -> N
     assert said.count("old") == 1
 
 
+def test_too_few_rounds_are_no_spent_budget(tmp_path: Path) -> None:
+    _, results, _ = play(tmp_path, Stage(), plan(rounds=2))
+    assert {record.message for record in results.methods} == {"results need 3 rounds; set --rounds"}
+
+
 def test_an_end_during_compilation_is_reported(tmp_path: Path) -> None:
     stage = Stage(case_reslrb_stack=Pretence(ends=1))
     _, results, said = play(tmp_path, stage, plan())

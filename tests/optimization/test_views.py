@@ -12,6 +12,7 @@ from optimization.toy import make_problem
 
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
@@ -164,6 +165,19 @@ def test_settings_without_lamps_of_a_view(lamps, setting, place, words):
         make(lamps, ONE_BY_ONE, *more)
     assert place in str(error.value)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("method", ["prb", "reslrb:stack"])
+def test_measurements_have_the_first_view_with_all_lamps(lamps, method):
+    """Stock integrators cannot switch lamps off."""
+    problem = make(lamps, ONE_BY_ONE, "run.held_out=[1]", "run.shards=1")
+    [case] = parse_cases(method)
+    measured = assemble(loads(dump(case.at(problem.config, 3, known=True)), str(lamps / "tiny.yaml")))
+    plain = assemble(loads(dump(case.at(make(lamps, "run.shards=1").config, 3, known=True)), str(lamps / "tiny.yaml")))
+    assert len(measured.views) == 1
+    np.testing.assert_array_equal(np.array(measured.views[0].target), np.array(plain.views[0].target))
+    whole = case.at(problem.config, 3, known=False, auto=True)
+    assert whole.views == problem.config.views
 
 
 def test_render_shows_a_view_with_its_lamps(lamps, monkeypatch):
