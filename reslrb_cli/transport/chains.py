@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from reslrb_cli.scene.rays import is_hidden, past_lamps, sensor_rays
+from reslrb_cli.scene.rays import is_hidden, past_lamps, ray_offset, sensor_rays
 from reslrb_cli.transport.bsdf import Hit, Specular, reflect_or_refract
 from reslrb_cli.transport.camera import sample_lamp
 from reslrb_cli.transport.connection import before_lamps, connect
@@ -150,10 +150,15 @@ class Chains(ABC):
         return dr.select(passes, Chain(ray, pi, chain.product * event.s, chain.count + 1, chain.code), chain)
 
     def lit(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> tuple[Target, mi.Bool]:
-        """Return the point y of a vertex, and the lanes in which a surface hides it."""
+        """Return the point y of a vertex, and the lanes in which a surface hides it.
+
+        A point y in the plane of the vertex does not count. It sends no light there, and rounding would decide whether
+        it is visible. This occurs on flat lamps.
+        """
         smooth = mi.has_flag(hit.bsdf.flags(), mi.BSDFFlags.Smooth)
         target = self.target(hit, count, active & (count > 0) & smooth & (count + 2 <= self.samples.plan.max_depth))
-        target.active &= dr.any(target.weight > 0)
+        height = dr.abs(dr.dot(hit.si.n, target.y - hit.si.p))
+        target.active &= dr.any(target.weight > 0) & (height > ray_offset(hit.si.p))
         samples = self.samples
         return target, is_hidden(
             samples.scene, hit.si, target.y, samples.plan.has_edges, target.active, self.passes_lamps

@@ -9,14 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, STEP, EdgeCase, split_box
+from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, SIZE, STEP, VIEW, EdgeCase, split_box
 from conformance.moving import Moving
 
 from reslrb_cli.estimators import chain_edges, edges, outline_rays
 from reslrb_cli.estimators.stack import StackState
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.scenes.small import load, transform
 from reslrb_cli.scene.edges import SPHERE, _edges_of, edge_normal, welded_edges
 from reslrb_cli.scene.rays import is_hidden, ray_offset
@@ -230,6 +230,18 @@ def test_choices_at_the_vertices_of_a_chain_are_independent():
     numbers = [np.array(chain.random(mi.UInt32(vertex), EVENTS).x) for vertex in range(4)]
     assert np.abs(np.corrcoef(numbers) - np.eye(4)).max() < 0.015
     assert np.abs(np.mean(numbers, 1) - 0.5).max() < 0.005
+
+
+def test_the_outline_of_a_lamp_in_a_moved_mirror():
+    """The image of the lamp is a square of `width` pixels. Its distance changes twice as fast as that of the mirror. At
+    depth 3, points of the lamp have points y on the same lamp.
+    """
+    moving, distance, speed = EdgeCase("facing", "glowing", motion=("y",)).moving(), 4.2, 2
+    moving.weigh(np.ones((SIZE, SIZE, 3)))
+    width = 0.5 / distance * SIZE / (2 * np.tan(np.deg2rad(VIEW / 2)))
+    tracer = integrator("reslrb", 3, estimator="stack", edges="on", paths="camera")
+    found = [moving.gradient(tracer, seed, 64)["shape.y"][0] for seed in seeds(4)]
+    assert np.mean(found) == pytest.approx(3 * 4 * width**2 * (-2 / distance) * speed, rel=0.03)
 
 
 def test_edges_whose_chain_ends_early_do_not_count(monkeypatch: pytest.MonkeyPatch):
