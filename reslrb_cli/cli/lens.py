@@ -99,19 +99,6 @@ class LensOptions:
             raise ConfigError("--output", "", f"{taken} exists; give another folder, or remove it")
 
 
-def similarity(image: np.ndarray, picture: np.ndarray) -> str:
-    """Return the SSIM of two images in words, as in fabrication.json. The text is empty for images that
-    are smaller than the window of SSIM.
-    """
-    from skimage.metrics import structural_similarity
-
-    if min(picture.shape) < 7:
-        return ""
-    seen, wanted = image / image.mean(), picture / picture.mean()
-    value = float(structural_similarity(seen, wanted, data_range=float(wanted.max())))
-    return f"; SSIM with the picture {value:.2f}"
-
-
 #: Seconds from the start, and from line to line, without a terminal.
 SECONDS_PER_LINE = 5.0
 
@@ -199,7 +186,7 @@ def command(**given: Any) -> None:
 
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.lens import experiment
-    from reslrb_cli.lens.surface import Setting, is_even, shape_surface
+    from reslrb_cli.lens.surface import Setting, is_even, shape_surface, similarity
     from reslrb_cli.lens.transport import resized
 
     options = LensOptions(**given)
@@ -268,6 +255,8 @@ def command(**given: Any) -> None:
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
     for line in solid:
         echo(line)
-    echo(f"{output / 'preview.png'}: the caustic at the start{similarity(preview, original)}")
+    # SSIM has a window of 7 x 7 pixels.
+    alike = f"; SSIM with the picture {similarity(preview, original):.2f}" if min(original.shape) >= 7 else ""
+    echo(f"{output / 'preview.png'}: the caustic at the start{alike}")
     echo(f"{output / 'lens.yaml'}: {nx}x{ny} heights, a picture of {columns}x{rows} pixels")
     echo(f"next: `reslrb optimize {output / 'lens.yaml'}`")

@@ -270,6 +270,16 @@ def is_even(picture: Array) -> bool:
     return bool(picture.max() - picture.min() <= 0.02 * picture.max())
 
 
+def similarity(image: Array, picture: Array) -> float:
+    """Return the SSIM of two luminances (H, W), each divided by its mean, by scikit-image. The maximum of the divided
+    picture is data_range.
+    """
+    from skimage.metrics import structural_similarity
+
+    seen, wanted = image / max(float(image.mean()), 1e-30), picture / picture.mean()
+    return float(structural_similarity(seen, wanted, data_range=float(wanted.max())))
+
+
 def _check(picture: Array, setting: Setting) -> None:
     s = setting
     if picture.ndim != 2 or min(picture.shape) < 2:

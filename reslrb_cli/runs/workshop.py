@@ -21,6 +21,7 @@ from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.glasses import Glass
 from reslrb_cli.lens.solid import Sheet
+from reslrb_cli.lens.surface import similarity
 from reslrb_cli.records.images import luminance
 from reslrb_cli.report.page.workshop import shown_ssim
 from reslrb_cli.scene.graph import is_one_of
@@ -51,16 +52,13 @@ def figures(image: Array, target: Array) -> dict[str, float]:
     """Compare luminances (H, W) within the picture: SSIM, L1 and contrast (standard deviation over mean).
 
     Also returns the target's `contrast`, and the share of the film's light that falls into the picture. The picture is
-    the bounding rectangle of the target's nonzero pixels. Each image is divided by its mean within the picture. SSIM is
-    computed by scikit-image, with the target's maximum as data_range.
+    the bounding rectangle of the target's nonzero pixels. Each image is divided by its mean within the picture.
     """
-    from skimage.metrics import structural_similarity
-
     inside = picture_within(target)
     seen, wanted = image[inside], target[inside]
     seen, wanted = seen / max(float(seen.mean()), 1e-30), wanted / wanted.mean()
     return {
-        "ssim": float(structural_similarity(seen, wanted, data_range=float(wanted.max()))),
+        "ssim": similarity(seen, wanted),
         "l1": float(np.abs(seen - wanted).mean()),
         "inside": float(image[inside].sum() / max(float(image.sum()), 1e-30)),
         "contrast": float(seen.std()),

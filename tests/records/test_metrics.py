@@ -151,6 +151,14 @@ def test_a_log_is_cut_back_to_the_iterations_of_a_state(tmp_path: Path, damage: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_line_without_its_end_is_dropped(tmp_path: Path) -> None:
+    """The next line would continue it."""
+    lines = written(tmp_path, 3)
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
+    assert cut_back(tmp_path, 3) == 1
+    assert (tmp_path / "metrics.jsonl").read_text() == f"{lines[0]}\n{lines[1]}\n"
+
+
 # The first line of a file of measurements.
 
 

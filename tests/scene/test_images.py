@@ -424,6 +424,15 @@ def test_channels_without_a_layer_come_first(tmp_path):
     assert (read_image(tmp_path / "a.exr") == 0.25).all()
 
 
+def test_the_first_of_several_parts_of_an_exr_is_read(tmp_path):
+    import OpenEXR
+
+    planes = {value: {letter: np.full((2, 2), value, np.float32) for letter in "RGB"} for value in (0.25, 0.5)}
+    parts = [OpenEXR.Part({"type": OpenEXR.scanlineimage}, planes[value], f"part {value}") for value in planes]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    assert (read_image(tmp_path / "a.exr") == 0.25).all()
+
+
 def test_several_layers_are_refused(tmp_path):
     (tmp_path / "a.exr").write_bytes(exr_of(["a.R", "a.G", "a.B", "b.R", "b.G", "b.B"], np.float32)[0])
     assert refused(tmp_path / "a.exr") == "has the layers a, b; save the one of the image alone"

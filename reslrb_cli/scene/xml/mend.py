@@ -245,17 +245,19 @@ class _Mender:
     def __init__(self, description: Description) -> None:
         self.notes: list[Note] = []
         #: Files for Mitsuba 0.x, and the elements whose parameters have other names in Mitsuba 3.
-        self.old = {file for file, version in description.files.items() if version.startswith("0.")}
+        self.old = [file for file, version in description.files.items() if version.startswith("0.")]
         self._renamed: list[Element] = []
 
     def renamed(self) -> Iterator[Note]:
         """Yield a note on the renamed parameters of each file for Mitsuba 0.x."""
         for file in self.old:
             found = {element.written: element for element in self._renamed if element.file == file}
-            for old, element in itertools.islice(found.items(), 1):
-                more = f", and {len(found) - 1} other names likewise" if len(found) > 1 else ""
-                done = f"read as {quoted(element.name)}{more}"
-                yield Note(element, f"{quoted(old)} is a name of Mitsuba 0.6", done=done, level=logging.INFO)
+            if not found:
+                continue
+            old, element = next(iter(found.items()))
+            more = f", and {len(found) - 1} other names likewise" if len(found) > 1 else ""
+            done = f"read as {quoted(element.name)}{more}"
+            yield Note(element, f"{quoted(old)} is a name of Mitsuba 0.6", done=done, level=logging.INFO)
 
     def tell(self, element: Element, wrong: str, done: str, level: int = logging.INFO) -> None:
         """Note a conversion if the element is in a file for Mitsuba 0.x."""
