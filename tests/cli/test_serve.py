@@ -156,8 +156,9 @@ def test_no_path_leaves_the_folder(served, runs):
     outside = runs.parent / "outside"
     (runs / "link").symlink_to(outside)
     (outside / "manifest.json").write_text((runs / "b" / "manifest.json").read_text())
-    for name in ("c", "d"):
+    for name in ("c", "d", "e"):
         shutil.copytree(runs / "a <b>", runs / name)
+    (runs / "e" / "later").symlink_to(outside / "later")
     (runs / "c" / "report.html").unlink()
     (runs / "c" / "report.html").symlink_to(outside / "report.html")
     (runs / "d" / "config.yaml").unlink()

@@ -25,7 +25,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import missing as missing_check
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing
+from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing, _ratio, _sums
 from reslrb_cli.measure.scenes.analytic import fresnel
 from reslrb_cli.measure.scenes.moving import Displacement, Move, Pose, smooth_fields, vertices
 from reslrb_cli.measure.scenes.small import transform
@@ -165,6 +165,12 @@ def test_errors_are_correct():
         z.append(((record.share or 0) - np.sqrt(0.5 / 7.25)) / (record.standard_error or 1))
     assert abs(np.mean(z)) < 0.3
     assert 0.8 < np.std(z) < 1.3
+
+
+def test_noise_does_not_enlarge_a_share():
+    """For two seeds, the square of the mean without its noise is the product of both samples."""
+    part, whole = np.array([[1.0], [4.0]]), np.array([[2.0], [8.0]])
+    assert _ratio(2, _sums(part), _sums(whole)) == pytest.approx(0.5)
 
 
 call = partial(ended, "gradcheck")

@@ -241,6 +241,17 @@ def test_shared_noise_sharpens_a_paired_comparison():
     assert compare_expectations(close * 1.01, reference, FAMILY, paired=False).verdict is Verdict.HOLDS
 
 
+def test_the_side_with_fewer_independent_entries_decides():
+    """All entries of one side have the same noise. Either side may be that one."""
+    count, entries = 16, len(TRUTH)
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        common = TRUTH + 0.2 * random.normal(size=(count, 1)) * np.ones(entries)
+        for ours, reference in ((common, noisy(seed)), (noisy(seed), common)):
+            limit = compare_expectations(ours, reference, FAMILY, paired=False).z_rms_limit
+            assert limit == pytest.approx(FAMILY.z_rms_limit(1), rel=0.05)
+
+
 def test_exact_values_and_their_errors():
     assert compare_expectations(noisy(1), TRUTH, FAMILY).verdict is Verdict.HOLDS
     assert compare_expectations(noisy(1), TRUTH + 0.5, FAMILY).verdict is Verdict.FAILS
