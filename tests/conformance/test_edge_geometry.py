@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.edge_cases import BOTH, OCCLUDERS, SHAPES, SIZE, STEP, VIEW, EdgeCase, split_box
+from conformance.edge_cases import BEHIND_THE_VEIL, BOTH, OCCLUDERS, SHAPES, SIZE, STEP, VIEW, EdgeCase, split_box
 from conformance.moving import Moving
 
 from reslrb_cli.estimators import chain_edges, edges, outline_rays
@@ -17,11 +17,12 @@ from reslrb_cli.estimators.stack import StackState
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.scenes.small import load, transform
+from reslrb_cli.measure.scenes.small import load, room, transform
 from reslrb_cli.scene.edges import SPHERE, _edges_of, edge_normal, welded_edges
 from reslrb_cli.scene.rays import is_hidden, ray_offset
+from reslrb_cli.transport.bsdf import Hit, reflect_or_refract
 from reslrb_cli.transport.chains import EVENTS, SensorChains
-from reslrb_cli.transport.edges import sample_outline, view_from_lamps
+from reslrb_cli.transport.edges import sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.samples import Samples
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -221,7 +222,36 @@ def test_light_from_other_surfaces_reaches_a_contact():
     assert np.mean(np.array(between.active)[from_above]) > 0.6
 
 
+def test_things_before_the_clip_plane_hide_no_outline():
+    """A lamp hangs between the sensor and the box."""
+    seen = []
+    for clip in (0.01, BEHIND_THE_VEIL):
+        samples = outline_samples(EdgeCase("box", "veil", near_clip=clip).moving(), "shape.vertex_positions", 3)
+        samples = outline_rays.for_camera(samples)
+        chances = outline_rays.chances_of(samples, samples.stream(edges.SENSOR_EDGES))
+        view = view_from_sensor(samples, chances.viewpoint)
+        beside = outline_rays.both_sides(samples, sample_outline(samples, samples.edges.sensor, view, chances))
+        seen.append(np.mean(np.array(beside.active)))
+    print(seen)
+    assert seen[1] > 2 * seen[0]
+    assert seen[1] > 0.3
+
+
 # ---- Edges behind chains ----
+
+
+def test_every_number_selects_a_delta_lobe():
+    """A blend of glass and a mirror has three lobes on its front side. Together they lose no light."""
+    blend = {"type": "blendbsdf", "weight": 0.4, "glass": {"type": "dielectric"}, "mirror": {"type": "conductor"}}
+    scene = load(room(pane={"type": "rectangle", "to_world": transform(translate=[0, 0, 2]), "bsdf": blend}))
+    job = Job(scene, scene.sensors()[0], dr.opaque(mi.UInt32, 1), 16, None)
+    plan = integrator("reslrb", 4, estimator="stack", paths="light").passes(job)[0].plan
+    number = (dr.arange(mi.Float, 1000) + 0.5) / 1000
+    ray = mi.Ray3f(mi.Point3f(number - 0.5, 0, 2.5), dr.normalize(mi.Vector3f(0.3, 0.2, -1)))
+    si = scene.ray_intersect(ray)
+    event = reflect_or_refract(plan, Hit(si, si.bsdf(), ray), number, mi.Bool(True))
+    assert dr.all(event.active)
+    assert np.mean(np.array(event.s)) == pytest.approx(1, abs=2e-3)
 
 
 def test_choices_at_the_vertices_of_a_chain_are_independent():

@@ -25,7 +25,7 @@ from reslrb_cli.optimization.views import View
 from reslrb_cli.records.decisions import Decision, DecisionCache
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.deformation import Moves
-from reslrb_cli.scene.needs import camera_finds_all, light_finds_all
+from reslrb_cli.scene.needs import camera_finds_all, light_finds_all, usual_paths
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -250,6 +250,17 @@ def test_beams_and_scaled_emitters_are_left_to_light_paths():
     assert paths(beam=beam, sun=sun(1)) == "both"
     assert paths(sun=sun(1)) == "both"
     assert paths(sun=sun(2)) == "light"
+
+
+def test_paths_suit_all_sensors():
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    scene = mi.load_dict({
+        "type": "scene", "first": {"type": "perspective"}, "second": {"type": "radiancemeter", "film": film},
+        "wall": {"type": "rectangle"}, "lamp": {"type": "point", "position": [0, 0, -3]},
+    })  # fmt: skip
+    sensors = scene.sensors()
+    found = [usual_paths(scene, seen, 4, False, False) for seen in (sensors[:1], sensors[1:], sensors, sensors[::-1])]
+    assert found == ["both", "camera", "camera", "camera"]
 
 
 @pytest.mark.parametrize(("name", "settings", "paths"), [

@@ -155,7 +155,7 @@ BAD = [
     ),
     *(
         ({key: True}, rf"frames\[0\].{key}: is True; only pinhole cameras")
-        for key in ("is_fisheye", "latlong", "equirectangular", "is_orthographic", "spherical")
+        for key in ("is_fisheye", "Is_Fisheye", "latlong", "equirectangular", "is_orthographic", "spherical")
     ),
     ({"fl_y": 60.0}, r"frames\[0\]: has focal lengths 50 and 60"),
     ({"fl_x": None}, r"frames\[0\].fl_x: missing"),
