@@ -169,7 +169,7 @@ def test_errors_are_correct():
 
 def test_noise_does_not_enlarge_a_share():
     """For two seeds, the square of the mean without its noise is the product of both samples."""
-    part, whole = np.array([[1.0], [4.0]]), np.array([[2.0], [8.0]])
+    part, whole = np.array([[1.0], [4.0]]), np.array([[4.0], [4.0]])
     assert _ratio(2, _sums(part), _sums(whole)) == pytest.approx(0.5)
 
 
