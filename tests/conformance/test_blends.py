@@ -18,7 +18,9 @@ from turns import a_few
 
 from reslrb_cli.measure.gradients import Case, integrator, seeds
 from reslrb_cli.measure.references import Situation, path_image, prb_gradient, ptracer_image
-from reslrb_cli.measure.scenes.small import camera, diffuse, rgb, room, transform
+from reslrb_cli.measure.scenes.small import camera, diffuse, load, rgb, room, transform
+from reslrb_cli.scene.graph import SceneGraph
+from reslrb_cli.scene.needs import blend_warning, uneven_blends
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -90,3 +92,25 @@ def test_stock_integrators_are_no_references_for_blends():
         at = Situation.of(case.scene, case.scene.sensors()[0], case.params, 4, False)
         for reason in (path_image(at), ptracer_image(at), prb_gradient(at, key)):
             assert (reason is not None and "blends of singular and smooth lobes" in reason) == refused
+
+
+def masked(bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "mask", "opacity": 0.5, "nested": bsdf}
+
+
+@pytest.mark.parametrize(
+    ("half", "named"),
+    [
+        ({"type": "plastic"}, "plastic"),
+        (masked({"type": "roughdielectric"}), "a mask over a BSDF that transmits light"),
+        (masked({"type": "principledthin", "diff_trans": 1.0}), "a mask over a BSDF that transmits light"),
+        (masked(diffuse(0.5, 0.5, 0.5)), None),
+        ({"type": "roughplastic"}, None),
+        ({"type": "conductor"}, None),
+    ],
+)
+def test_blends_that_stay_wrong_are_named(half: dict[str, Any], named: str | None):
+    bsdf = {"type": "blendbsdf", "weight": W, "first": diffuse(0, 0, 0), "second": half}
+    graph = SceneGraph.of(load(sheet(bsdf)))
+    warning = blend_warning(graph, uneven_blends(graph))
+    assert (warning is None) if named is None else f" blends {named} with other lobes" in warning

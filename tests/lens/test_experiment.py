@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,7 +15,7 @@ from click.testing import CliRunner
 from PIL import Image
 from turns import a_few
 
-from reslrb_cli.cli.lens import command, read_luminance
+from reslrb_cli.cli.lens import command, read_luminance, show_stages
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.lens import transport
@@ -95,6 +97,17 @@ def test_a_black_and_white_picture_becomes_a_lens(
     margin = (seen.shape[0] - min(side, pixels)) // 2
     assert seen[margin:-margin, margin:-margin].mean() == pytest.approx(1, rel=1e-5)
     assert seen.min() == 0
+
+
+def test_the_bar_of_the_stages_begins_at_0_and_stays_within_100_percent(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with show_stages(3) as tell:
+        for stage in range(6):
+            tell(f"stage {stage}")
+    shares = [int(share) for share in re.findall(r"(\d+)%\|.*?stage", terminal.getvalue())]
+    assert shares == [0, 33, 67, 100, 100, 100]
 
 
 def test_transparent_parts_of_a_picture_of_floats_are_white(tmp_path: Path) -> None:

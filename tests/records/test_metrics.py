@@ -16,7 +16,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines
-from reslrb_cli.records.metrics import MetricsWriter, Record, Regularized, cut_back, finite
+from reslrb_cli.records.metrics import MetricsWriter, NonFiniteTally, Record, Regularized, cut_back, finite
 
 # metrics.jsonl: its keys, values without a number, and lines that a crash cut short.
 
@@ -157,6 +157,14 @@ def test_a_line_without_its_end_is_dropped(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
     assert cut_back(tmp_path, 3) == 1
     assert (tmp_path / "metrics.jsonl").read_text() == f"{lines[0]}\n{lines[1]}\n"
+
+
+def test_iterations_with_values_that_are_not_finite_are_counted():
+    tally = NonFiniteTally()
+    for count in (0, 1, 3):
+        tally.add(make_record(nonfinite=count, nonfinite_by_parameter={"a": count} if count else {}))
+    assert (tally.iterations, tally.values, tally.by_parameter) == (2, 4, {"a": 4})
+    assert str(tally) == "4 values not finite (a 4) in 2 iterations"
 
 
 # The first line of a file of measurements.

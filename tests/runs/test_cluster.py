@@ -207,6 +207,14 @@ def test_calls_have_more_time_than_the_longest_one(me: SimpleNamespace, monkeypa
     assert calls.CALL_S + 10 * 2.0 <= known_s < calls.CALL_S + 10 * 2.0 + 5
 
 
+def test_places_have_bounds() -> None:
+    assert Cluster.parse("tls://there:65535") == Cluster(address="tls://there:65535")
+    assert Cluster.parse(f"local:{connection.MOST_WORKERS}") == Cluster(connection.MOST_WORKERS)
+    for text in ("tls://there:65536", "tls://there:0", f"local:{connection.MOST_WORKERS + 1}", "local:0", "local:-1"):
+        with pytest.raises(ConfigError, match="--cluster: must be local:N"):
+            Cluster.parse(text)
+
+
 @pytest.mark.parametrize(("workers", "threads"), [(1, 6), (4, 1), (7, 1)])
 def test_workers_share_the_cores(workers: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(6)))
