@@ -88,6 +88,7 @@ SIMILAR = (
     "sphere-room-5",
     "cylinder-directional-2",
     "rectangle-spot-2",
+    "sphere-point-2",
     "box-moving_area-2",
     "box-moving_spot-2",
     "flat-area-2",  # no planted fault needs these two: those of edges between surfaces show in two-area-3 as well
