@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import Agreement, compare
+from conformance import test_edge_geometry
 from conformance.edge_cases import (
     BEHIND_THE_VEIL,
     CAMERA,
@@ -211,6 +212,8 @@ FAULTS = [
           " - view.clip", ""),
     Fault("mirrors_show_no_hidden_lamp", "lamp_in_a_mirror", "transport.camera:camera_walk",
           "plan.sees_through_lamps and first.begins_path", "plan.sees_through_lamps"),
+    Fault("points_of_a_flat_lamp_light_each_other", "lamp_in_a_moved_mirror", "transport.chains:Chains.lit",
+          " & (height > ray_offset(hit.si.p))", ""),
     Fault("parallel_light_has_no_edges", "parallel_light", "transport.plan:Plan.finding_beams",
           "beams = not self.camera and any(", "beams = False and any("),
 ]  # fmt: skip
@@ -427,6 +430,7 @@ EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "points": lambda monkeypatch: check_points("sensor", False),
     "hidden_lamp": lambda monkeypatch: check_hidden_lamp(),
     "lamp_in_a_mirror": lambda monkeypatch: check_lamp_in_a_mirror(),
+    "lamp_in_a_moved_mirror": lambda monkeypatch: test_edge_geometry.test_the_outline_of_a_lamp_in_a_moved_mirror(),
     "parallel_light": lambda monkeypatch: check_parallel_light(),
     "blended_mirror": lambda monkeypatch: check_blended_mirror(),
 }  # fmt: skip
