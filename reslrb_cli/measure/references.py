@@ -285,6 +285,8 @@ def prb_gradient(at: Situation, key: str) -> str | None:
         return reason
     if np.any(np.array(values_of(at.params, key)) == 0):
         return "it loses derivatives if a channel is exactly 0"
+    if any(lamp.surrounds for lamp in at.needs.lamps):
+        return "it is some tenths of a percent off inside of an emitting sphere"
     if parameter_kind(at.params, key) != "emitter" and any(
         int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in bsdfs_of(at, key)
     ):
