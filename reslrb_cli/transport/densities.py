@@ -35,6 +35,7 @@ class EmitterDensities:
     `choice` is the probability of selecting an emitter. `emitted` is e without the factor that varies between rays, for
     example a texture's density. `kind` tells which factor this is. If not all emitters are lit, `lit` (L,) has the
     indices of the lit ones in `scene.emitters()`, and `ends` (L,) has the cumulative sums of their probabilities.
+    `on` (R,) is 1 for the lit ones, which may have the probability 0.
     """
 
     choice: mi.Float
@@ -42,6 +43,7 @@ class EmitterDensities:
     kind: mi.UInt32
     lit: mi.UInt32 | None = None
     ends: mi.Float | None = None
+    on: mi.UInt32 | None = None
 
     @staticmethod
     def of(plan: Plan, scene: mi.Scene) -> EmitterDensities:
@@ -59,7 +61,10 @@ class EmitterDensities:
             emitted[number] = choice[number] * own
         made = [(mi.Float, choice), (mi.Float, emitted), (mi.UInt32, kind)]
         if plan.lit is not None:  # opaque as well, so that views with other lamps have the same kernels
-            made += [(mi.UInt32, np.array(lit)), (mi.Float, np.cumsum(sampled[[*lit]]) / sampled.sum())]
+            on = np.zeros(len(choice))
+            on[[numbers[index] for index in lit]] = 1
+            ends = np.cumsum(sampled[[*lit]]) / sampled.sum()
+            made += [(mi.UInt32, np.array(lit)), (mi.Float, ends), (mi.UInt32, on)]
         return EmitterDensities(*(own_memory(kind, array) for kind, array in made))
 
     def select(self, number: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float, mi.Float]:

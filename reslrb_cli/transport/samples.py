@@ -289,8 +289,8 @@ class Samples:
         if self.plan.lit is None:
             return emitter
         assert self.emitters is not None
-        chance = dr.gather(mi.Float, self.emitters.choice, dr.reinterpret_array(mi.UInt32, emitter), active)
-        return dr.select(chance > 0, emitter, dr.zeros(mi.EmitterPtr))
+        on = dr.gather(mi.UInt32, self.emitters.on, dr.reinterpret_array(mi.UInt32, emitter), active)
+        return dr.select(on != 0, emitter, dr.zeros(mi.EmitterPtr))
 
     def chance_of(self, lamp: Lamp) -> mi.Float:
         """Return the probability that `choose_emitter` selects a lamp."""

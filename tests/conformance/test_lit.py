@@ -73,6 +73,14 @@ def test_images_lack_the_light_of_lamps_that_are_off(whole: Any, lit: tuple[str,
     assert result, result
 
 
+def test_a_lamp_that_is_never_sampled_is_still_met(llvm: str) -> None:
+    bulbs = {f"bulb {k}": {"type": "point", "position": [k, 1.5, 1]} for k in range(2)}
+    scene = stage({**bulbs, "lamp": lamp(position=(0.4, 1.6, -0.8), target=(0, 0.3, 2), sampling_weight=0.0)})
+    seen = [render_image(lit_by(lit, scene, paths="camera", estimator="stack"), scene, 0, 1, 16).array
+            for lit in (("bulb 0", "lamp"), ("bulb 0",))]  # fmt: skip
+    assert float(dr.max(seen[0])[0]) > 5 > float(dr.max(seen[1])[0])
+
+
 def gradients(tracer: Any, scene: Any, keys: list[str], seeds: range) -> np.ndarray:
     """Return the gradients of the mean image for each seed, as one flat array (N, P)."""
     params, found = mi.traverse(scene), []
