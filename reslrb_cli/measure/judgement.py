@@ -134,13 +134,13 @@ class MethodSamples:
         mean, variance = self.deviations.mean(0), self.variance * self.reference.signal
         return max(0.0, float(mean @ mean - variance / self.count - self.reference.noise)) / self.reference.signal
 
-    def _levels(self) -> list[tuple[int, int, float]]:
-        """Return the length, the number and the mean squared error of averages of 1, 2, 4, ... steps, up to the number
-        of steps. The squared error of the reference is subtracted.
+    def _levels(self) -> list[tuple[int, np.ndarray, float]]:
+        """Return averages of 1, 2, 4, ... steps, up to the number of steps: the length, the deviations of the averages
+        (N, P), and their mean squared error. The squared error of the reference is subtracted.
         """
         found, averages, steps = [], self.deviations, 1
         while len(averages):
-            found.append((steps, len(averages), float(np.square(averages).sum(1).mean()) - self.reference.noise))
+            found.append((steps, averages, float(np.square(averages).sum(1).mean()) - self.reference.noise))
             pairs = len(averages) // 2
             averages, steps = 0.5 * (averages[0 : 2 * pairs : 2] + averages[1 : 2 * pairs : 2]), 2 * steps
         return found
@@ -150,9 +150,28 @@ class MethodSamples:
         signal, floor = self.reference.signal, self.reference.floor
         return [
             PointRecord(method, parameter, steps, steps * self.step_s,
-                        float(np.sqrt(squared / signal)) if squared > 0 else None, floor, repeats)
-            for steps, repeats, squared in self._levels()
+                        float(np.sqrt(squared / signal)) if squared > 0 else None, floor, len(averages),
+                        *self._interval(averages, squared))
+            for steps, averages, squared in self._levels()
         ]  # fmt: skip
+
+    def _interval(self, averages: np.ndarray, squared: float) -> tuple[float, float] | tuple[None, None]:
+        """Return the interval of the relative error of averages whose mean squared error is `squared`. Return None for
+        both ends if there are too few averages, or if `squared` is not positive.
+
+        The interval is that of the error's logarithm, because the squared errors of a few entries are skewed.
+        """
+        count, reference = len(averages), self.reference
+        if squared <= 0 or count < FEWEST_AVERAGES:
+            return None, None
+        squares, value = np.square(averages).sum(1), np.log(squared / reference.signal)
+        moved, noises, signals = reference.without
+        own = ((squares.sum() - squares) / (count - 1) - reference.noise) / reference.signal
+        other = squares.mean() - 2 * moved @ averages.mean(0) + np.square(moved).sum(1) - noises
+        # the delta method, because leaving out a row may lower an error below 0
+        relative = [value + side * reference.signal / squared for side in (own, other / signals)]
+        found = _joined(value, *relative).exponential()
+        return float(np.sqrt(found.low)), float(np.sqrt(found.high))
 
     def slope(self) -> float | None:
         """Return d log RMSE / d log time, or None if there are too few steps. The slope is about -1/2 for independent,
@@ -160,7 +179,11 @@ class MethodSamples:
 
         The fit weights the error for each average length by the number of averages of that length.
         """
-        known = [level for level in self._levels() if level[1] >= FEWEST_AVERAGES and level[2] > 0]
+        known = [
+            (steps, len(averages), squared)
+            for steps, averages, squared in self._levels()
+            if len(averages) >= FEWEST_AVERAGES and squared > 0
+        ]
         if self.count < FEWEST_FOR_SLOPE or len(known) < 2:
             return None
         steps, repeats, squared = np.transpose(known)

@@ -455,7 +455,8 @@ class ConvergencePlan(Measurement):
         estimator = replace(case, options=own).estimator
         label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
         capacity = options.get("capacity")
-        return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config))
+        depth = config.integrator.max_depth
+        return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config), max_depth=depth)
 
 
 def machine_of(config: Config) -> dict[str, Any]:

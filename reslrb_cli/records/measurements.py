@@ -110,7 +110,8 @@ class Method:
 
     `estimator` and `capacity` are None if they do not apply. `adjoint` is `run.adjoint`, or None if dL/dI is fixed or
     nothing is differentiated. `label` is the method as the user wrote it, and `spp` the samples per pixel of a step.
-    `paths` and `light_share` are as in a `BenchRecord`. With `auto` and None, the run decides.
+    `paths` and `light_share` are as in a `BenchRecord`. With `auto` and None, the run decides. `max_depth` is None in
+    records of older versions.
     """
 
     label: str
@@ -121,6 +122,7 @@ class Method:
     spp: int
     paths: str = "light"
     light_share: float | None = None
+    max_depth: int | None = None
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,8 @@ class PointRecord(Line):
     `parameter` is a parameter key, `all` (all parameters together, if there are several) or `image`. Errors are in L2
     over all entries, relative to the norm of the estimated quantity. `relative_rmse` is the root mean square error of
     `repeats` averages. The error of the reference, `reference_rmse`, is subtracted. If `reference_rmse` exceeds the
-    measured error, `relative_rmse` is None.
+    measured error, `relative_rmse` is None. `low` and `high` are the ends of the 95 % interval of `relative_rmse`. They
+    are None if `relative_rmse` is None, or if there are too few averages.
     """
 
     KIND: ClassVar[str] = "point"
@@ -142,6 +145,8 @@ class PointRecord(Line):
     relative_rmse: float | None
     reference_rmse: float | None
     repeats: int
+    low: float | None = None
+    high: float | None = None
 
 
 @dataclass(frozen=True)

@@ -223,6 +223,24 @@ def test_errors_are_those_of_averages_without_that_of_the_reference() -> None:
     assert VARIANCE / 32 + np.mean([s.reference.noise for s in made]) > 4 * VARIANCE / 32
 
 
+@pytest.mark.parametrize("rows", [8, 24])
+def test_the_intervals_of_errors_have_their_coverage(rows: int) -> None:
+    """Errors from fewer than four averages have no interval. The true errors are VARIANCE / n, relative to SIGNAL."""
+    made = [make(seed, steps=64, rows=rows) for seed in range(REPETITIONS)]
+    found = [samples.points(METHOD, KEY) for samples in made]
+    for level, point in enumerate(found[0]):
+        known = [points[level] for points in found if points[level].low is not None]
+        if point.repeats < 4:
+            assert not known
+            continue
+        assert all(each.low < each.relative_rmse < each.high for each in known)
+        truth = np.sqrt(VARIANCE / point.steps / SIGNAL)
+        covered = sum(each.low < truth < each.high for each in known)
+        assert len(known) >= REPETITIONS - 1
+        assert LEAST <= covered <= MOST
+    assert all(p.low is None for points in found for p in points if p.relative_rmse is None)
+
+
 def test_the_floor_and_the_signal() -> None:
     made = [make(seed).reference for seed in range(REPETITIONS)]
     for values, truth in (([r.noise for r in made], VARIANCE / 144), ([r.signal for r in made], SIGNAL)):
