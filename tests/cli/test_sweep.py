@@ -30,13 +30,14 @@ from reslrb_cli.records.sweeps import (
     SweepBestRecord,
     SweepPlan,
     SweepRunRecord,
+    SweepSearch,
     in_words,
     read_sweep,
     run_name,
     short_keys,
 )
 from reslrb_cli.report.page import sweep as curves
-from reslrb_cli.report.page.sweep import best_records, lines, notes, row_records, run_records
+from reslrb_cli.report.page.sweep import best_records, incomparable, lines, notes, row_records, run_records
 from reslrb_cli.report.sources import ShownRun, read_sweep_runs
 from reslrb_cli.runs import recorder as recording
 from reslrb_cli.runs import sweep as plans
@@ -482,6 +483,26 @@ def test_the_best_is_judged_by_seeds_that_all_share():
     noted = "the loss of each integrator has its own noise"
     assert [any(noted in line for line in notes(*pretended([noise, noise], key)))
             for key in ("integrator.guiding", "run.spp")] == [True, False]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "found"),
+    [
+        ("variant", ["llvm_ad_rgb", "llvm_ad_spectral"], "variant"),
+        ("integrator.max_depth", [3, 6], "integrator.max_depth"),
+        ("integrator.hide_emitters", [True, False], "integrator.hide_emitters"),
+        ("integrator", ["prb", "reslrb:stack(hide_emitters=true)"], "integrator.hide_emitters"),
+        ("integrator", [{"type": "prb", "max_depth": 3}, {"type": "prb", "max_depth": 6}], "integrator.max_depth"),
+        ("integrator", [{"type": "prb", "max_depth": 3}, {"type": "ptracer", "max_depth": 3}], ""),
+        ("integrator", ["prb", "reslrb:stack(paths=camera)"], ""),
+    ],
+)
+def test_losses_of_different_light_are_not_compared(key, values, found):
+    combinations = [Combination(str(place), {key: value}) for place, value in enumerate(values)]
+    sweep = SweepPlan("a.yaml", [], combinations, [0])
+    assert incomparable(sweep, "loss") == found
+    assert incomparable(replace(sweep, combinations=[], search=SweepSearch(3, {key: values})), "loss") == found
+    assert not incomparable(sweep, "error")
 
 
 def test_curves_are_medians_with_minimum_and_maximum():

@@ -6,7 +6,7 @@ Losses are those of the final images, with `run.final_spp` samples. Runs with th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import ExitCode
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import Band
@@ -42,9 +43,10 @@ Array = np.ndarray[Any, Any]
 
 #: Settings that make losses, or errors, incomparable if they vary.
 OTHERS = {
-    "loss": ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out"),
+    "loss": ("loss", "views", "target", "scene", "parameters", "run.final_spp", "run.held_out", "variant",
+             "integrator.max_depth", "integrator.hide_emitters"),
     "error": ("scene", "parameters"),
-}
+}  # fmt: skip
 
 #: Maximum width of a setting's value in the table, and of a combination in a line.
 VALUE_WIDTH, LABEL_WIDTH = 32, 60
@@ -162,8 +164,25 @@ def incomparable(sweep: SweepPlan, of: str) -> str:
     """Return the first varied setting that changes the meaning of the loss or the error. The result is empty if there
     is none. Learning rates change neither.
     """
-    keys = [key for key in sweep.keys if not key.endswith("learning_rate")]
+    given: dict[str, Any] = {key: [each.settings[key] for each in sweep.combinations] for key in sweep.keys}
+    if sweep.search:
+        given = sweep.search.space
+    found = (leaf for key, values in given.items() for leaf in _leaves(key, values))
+    keys = [key for key in found if not key.endswith("learning_rate")]
     return next((key for key in keys if any(f"{key}.".startswith((f"{o}.", f"{o}[")) for o in OTHERS[of])), "")
+
+
+def _leaves(key: str, values: Any) -> Iterator[str]:
+    """Yield a varied setting, or the settings of a section in which the section's `values` differ."""
+    if key == "integrator" and isinstance(values, list):
+        values = [dict(parse_cases(value)[0].options) if isinstance(value, str) else value for value in values]
+    if not isinstance(values, list) or not all(isinstance(value, Mapping) for value in values):
+        yield key
+        return
+    for name in dict.fromkeys(name for value in values for name in value):
+        own = [value.get(name) for value in values]
+        if any(value != own[0] for value in own):
+            yield from _leaves(f"{key}.{name}", own)
 
 
 def varies_integrator(sweep: SweepPlan) -> bool:
