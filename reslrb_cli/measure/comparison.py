@@ -15,9 +15,9 @@ random signs. Each projection includes every texel, and the projection's noise i
 the sum of all entries, in which small errors add up.
 
 Samples are (N, P): N seeds, P entries. Gradients are compared over many seeds by z scores (`compare_expectations`), or
-at equal seeds by relative L2 (`compare_equal_seeds`). With equal seeds on both sides, the test of expectations uses the
-differences a - b. The paired test is valid for any noise that both sides share. More shared noise makes the test more
-powerful. z is the normal deviate with the same probability as t.
+at equal seeds by relative L2, of all entries together and of each entry (`compare_equal_seeds`). With equal seeds on
+both sides, the test of expectations uses the differences a - b. The paired test is valid for any noise that both sides
+share. More shared noise makes the test more powerful. z is the normal deviate with the same probability as t.
 
     t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)
 
@@ -261,6 +261,9 @@ TILE_TAIL = 0.12
 #: error of the reference: no z score becomes large.
 NOISY = 10
 
+#: Entries below this fraction of the largest one may be rounding errors.
+NEGLIGIBLE = 1e-6
+
 #: Fewer seeds tell nothing about tails.
 TAIL_SEEDS = 8
 
@@ -344,15 +347,28 @@ def compare_expectations(
 def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = ROUNDING) -> Comparison:
     """Compare (N, P) samples with reference samples at the same seeds, by the relative L2 distance of all samples
     together.
+
+    Dim entries hardly count in this distance. The comparison therefore also fails if entries differ by their own size.
+    The mean square of these relative distances must be below `limit`, too: at most this share of the entries may be
+    zero by mistake.
     """
     problem = _problem(ours, reference)
     if problem is not None:
         return problem
     distance = float(np.linalg.norm(ours - reference) / np.linalg.norm(reference)) if reference.any() else np.inf
-    verdict, (cosine, variances) = Verdict.HOLDS if distance < limit else Verdict.FAILS, _alikeness(ours, reference)
+    sizes, differences = np.linalg.norm(reference, axis=0), np.linalg.norm(ours - reference, axis=0)
+    with np.errstate(over="ignore"):
+        own = differences / np.maximum(sizes, max(NEGLIGIBLE * sizes.max(), np.finfo(float).tiny))
+    cosine, variances = _alikeness(ours, reference)
+    verdict, message = Verdict.HOLDS if distance < limit else Verdict.FAILS, ""
+    if verdict is Verdict.HOLDS and not np.mean(np.square(own)) < limit:
+        wrong = np.count_nonzero(own > np.sqrt(limit))
+        message = f"{wrong} of {own.size} entries differ by up to {own.max():.2g} times their own size"
+        verdict = Verdict.FAILS
     return Comparison(
-        verdict, distance, relative_l2_limit=limit, cosine=cosine, variance_ratio=variances, detectable=limit
-    )
+        verdict, distance, relative_l2_limit=limit, cosine=cosine, variance_ratio=variances, detectable=limit,
+        message=message,
+    )  # fmt: skip
 
 
 def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:

@@ -306,6 +306,28 @@ def test_equal_seeds_are_compared_by_relative_l2():
     assert (result.verdict, result.relative_l2) == (Verdict.FAILS, pytest.approx(1e-3))
 
 
+@pytest.mark.parametrize(("wrong", "entries"), [(90, 100), (1, 100), (1, 5000)])
+def test_dim_entries_count_at_equal_seeds(wrong: int, entries: int):
+    """Entries that are zero by mistake are too dim for the distance of all entries together."""
+    reference = np.random.default_rng(5).normal(size=(16, entries)) * np.where(np.arange(entries) < wrong, 1e-5, 1)
+    ours = np.where(np.arange(entries) < wrong, 0, reference)
+    result = compare_equal_seeds(ours, reference)
+    assert result.relative_l2 < 1e-4
+    assert (result.verdict, result.detectable) == (Verdict.FAILS, 1e-4)
+    assert result.message == f"{wrong} of {entries} entries differ by up to 1 times their own size"
+
+
+@pytest.mark.parametrize("seeds", [1, 4, 16])
+def test_rounding_is_no_fault_of_dim_entries_at_equal_seeds(seeds: int):
+    """Entries of all sizes have a relative rounding error. Entries that are zero have a rounding error of others."""
+    random = np.random.default_rng(seeds)
+    for _ in range(200):
+        reference = random.normal(size=(seeds, 300)) * 10.0 ** random.uniform(-12, 0, 300)
+        ours = reference * (1 + 1e-5 * random.normal(size=reference.shape))
+        reference[:, :20], ours[:, :20] = 0, 1e-9 * random.normal(size=(seeds, 20))
+        assert compare_equal_seeds(ours, reference).verdict is Verdict.HOLDS
+
+
 def test_limits_grow_with_the_table():
     assert Family(1, 1, 0.05).z_max_limit == pytest.approx(1.96, abs=0.01)
     assert Family(50, 1000).z_max_limit > Family(1, 10).z_max_limit
