@@ -321,8 +321,8 @@ def gradcheck(
 
     - `integrators`: a list of estimators, such as `reslrb:stack,reslrb:reservoir(capacity=4)`, and of your own Mitsuba
         integrators, `FILE.py:CLASS[(OPTION=VALUE,...)]` (docs/your_integrator.md). Default: all four estimators.
-    - `budget`: total time in seconds.
-    - `seeds`: number of seeds, at least 3, regardless of `budget`.
+    - `budget`: total time in seconds. Comparisons with too few seeds by then are unresolved.
+    - `seeds`: number of seeds, at least 3, regardless of `budget`. Default: 16, within `budget`.
     - `spp`: samples per pixel of one gradient.
     - `allow_code`: permit running the code of the integrators' files.
 

@@ -5,7 +5,6 @@ lack.
 from __future__ import annotations
 
 import difflib
-import logging
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -157,9 +156,6 @@ def _case_line(case: str, rows: list[GradcheckRecord]) -> str:
     return f"{case:<40}  max |z| {z:4.1f}  equal seeds {distance:.0e}  {holds} of {len(rows)}{left}  {verdict}"
 
 
-logger = logging.getLogger(__name__)
-
-
 @click.command("gradcheck")
 @optional_experiment_arguments
 @click.option("--suite", metavar="extreme[:CASE,...]",
@@ -172,11 +168,10 @@ logger = logging.getLogger(__name__)
         "the options of CONFIG, and reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows "
         "both.")  # fmt: skip
 @click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
-              help=
-        "Time limit, including loading and compiling; it determines the number of seeds. Comparisons without "
-        "time are named.")  # fmt: skip
+              help="Time limit, including loading and compiling. Comparisons with too few seeds by then are "
+                   "unresolved.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
-              help="Number of seeds, for any time.")  # fmt: skip
+              help="Number of seeds, without a time limit. Default: 16.")  # fmt: skip
 @allow_code_option
 @json_option
 @click.option("--spp", type=COUNT,
@@ -214,7 +209,8 @@ def command(**given: Any) -> int:
     )
     variant = set_variant(config.variant)
     check = Gradcheck(checked)
-    echo(f"{device_name(variant)}, {variant}; {allowance(options.budget, options.seeds, 'seed')}")
+    limit = allowance(options.budget, options.seeds, "seed")
+    echo(f"{device_name(variant)}, {variant}; {limit if options.seeds else f'{check.seeds} seeds, {limit}'}")
     echo(check.conditions())
     records, interrupted = _run(check, variant, options)
     none = "interrupted before there were enough seeds to compare"
@@ -234,15 +230,13 @@ def _run(check: Gradcheck, variant: str, options: GradcheckOptions) -> tuple[lis
     """Measure, print and write. Return all records, and True if the user interrupted."""
     from reslrb_cli.report.tables import cells, gradcheck_columns
 
-    records: list[GradcheckRecord] = []
-    keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
+    keeper = Keeper(options.json_file, origin_of(variant), lambda: check.records(interrupts.requested))
     with Interrupts() as interrupts:
-        table = gradcheck_columns(check.expected())
+        records = list(check.run(lambda: interrupts.requested, echo, keeper.refresh))
+        keeper.finish(interrupts.requested)
+        table = gradcheck_columns(records)
         echo(table.head())
-        for record in check.run(lambda: interrupts.requested, logger.info, keeper.refresh):
-            records.append(record)
-            keeper.refresh()
+        for record in records:
             if record.verdict is not Verdict.NOT_MEASURED:  # the last lines say how many there are
                 echo(table.line(cells(record)))
-        keeper.finish(interrupts.requested)
     return records, interrupts.requested

@@ -163,31 +163,73 @@ def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.
     assert failures(check(*SMALLER, estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
 
 
-def test_unmeasured_comparisons_are_named():
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *SMALLER])
-    ticks = iter(range(10_000))
-    made = Gradcheck(CheckSettings(config, estimators_of("stack,event"), 40), now=lambda: next(ticks))
+def pretended(settings: CheckSettings, monkeypatch: pytest.MonkeyPatch, load_s: float = 2.0) -> Gradcheck:
+    """Return a check whose samples only pretend. Each takes a second on the check's clock, and compiling 5 s more."""
+    clock, known = [0.0], set()
+
+    def sample(kind: str, of: str, seed: int) -> np.ndarray:
+        clock[0] += 1 if (kind, of) in known else 6
+        known.add((kind, of))
+        return np.random.default_rng(seed).normal(1, 0.1, 4 if kind in ("gradient", "image") else 2)
+
+    made = Gradcheck(settings, lambda: clock[0])
+    monkeypatch.setattr(made.participants, "sample", sample)
+    monkeypatch.setattr(made.participants, "choose_steps", lambda of: None)
+    clock[0] = load_s
+    return made
+
+
+def test_all_quantities_take_turns(monkeypatch: pytest.MonkeyPatch):
+    """The order does not depend on time. At the end, all quantities have as many seeds as were asked for."""
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
+    taken, made = [], pretended(CheckSettings(config, estimators_of("stack,event"), 0, 5), monkeypatch)
+    right = made.participants.sample
+    made.participants.sample = lambda *name: taken.append(name) or right(*name)
+    said: list[str] = []
+    made.draw(lambda: False, said.append, lambda: None)
+    names = [name[:2] for name in taken[: len(taken) // 5]]
+    assert len(set(names)) == len(names) == 8
+    assert taken == [(*name, seed) for seed in range(100, 105) for name in names]
+    assert said == ["1 of 5 seeds, 50 s", "2 of 5 seeds, 58 s", "4 of 5 seeds, 74 s"]
+
+
+@pytest.mark.parametrize(("budget_s", "counts"), [(0, {0}), (20, {0, 1}), (53, {1, 2}), (110, {8, 9}), (1e6, {16})])
+def test_a_budget_ends_early(budget_s: float, counts: set[int], monkeypatch: pytest.MonkeyPatch):
+    """A sample that has started is finished. Comparisons with fewer than 8 seeds are unresolved and say how many they
+    had, and comparisons without any are named.
+    """
+    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
+    made = pretended(CheckSettings(config, estimators_of("stack,event"), budget_s), monkeypatch)
+    monkeypatch.setattr(made.participants, "shape", lambda key: (4,))
+    monkeypatch.setattr(made.participants.case, "weights", np.zeros(4))
+    made.participants.case.places = dict.fromkeys(made.participants.case.places, slice(0, 4))
+    for chosen in made.participants.directions.values():
+        chosen[:] = [replace(direction, vector=np.ones(4)) for direction in chosen]
     records = list(made.run(lambda: False, lambda line: None))
-    assert next(ticks) < 50
-    # The second comparison got fewer seeds than it needs.
-    assert [record.verdict for record in records[:2]] == [Verdict.HOLDS, Verdict.UNRESOLVED]
-    left = [record for record in records if record.verdict is Verdict.NOT_MEASURED]
-    assert left
-    assert {(record.seeds, record.holds) for record in left} == {(0, None)}
-    assert (
-        summary_lines(records)[1] == f"open: {len(left)} not measured: the budget was spent; allow more with --budget"
-    )
+    assert {len(samples) for samples in made.draws.values()} <= counts
+    spent = "the budget was spent; allow more with --budget"
+    for record in records:
+        assert record.seeds in counts
+        if record.seeds == 0:
+            assert (record.verdict, record.message) == (Verdict.NOT_MEASURED, spent)
+        elif record.seeds < 8 and record.kind is not Kind.EQUAL_SEEDS:
+            assert (record.verdict, record.detectable is None) == (Verdict.UNRESOLVED, record.seeds == 1)
+            assert record.message == f"{record.seeds} of 16 seeds are too few to know the noise: {spent}"
+        else:
+            assert record.verdict in (Verdict.HOLDS, Verdict.FAILS)
+    left = [record for record in records if record.seeds == 0]
+    assert (f"open: {len(left)} not measured: {spent}" in summary_lines(records)) == bool(left)
 
 
 def test_an_interrupt_compares_the_finished_samples():
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *SMALLER])
     asked = iter(range(10_000))
     made = Gradcheck(CheckSettings(config, estimators_of("stack"), 0, 8))
-    records = list(made.run(lambda: next(asked) > 28, lambda line: None))
+    records = list(made.run(lambda: next(asked) > 10, lambda line: None))
     assert [(record.reference, record.seeds) for record in records] == [
-        (Reference.PTRACER, 8), (Reference.FINITE_DIFFERENCE, 5)
+        (Reference.PTRACER, 2), (Reference.FINITE_DIFFERENCE, 2), (Reference.FORWARD_MODE, 1),
+        (Reference.WALK_AD, 1), (Reference.PTRACER, 1),
     ]  # fmt: skip
-    assert list(made.run(lambda: True, lambda line: None)) != []
     fresh = Gradcheck(CheckSettings(config, estimators_of("stack"), 0, 8))
     assert list(fresh.run(lambda: True, lambda line: None)) == []
 
