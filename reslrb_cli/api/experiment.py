@@ -309,7 +309,7 @@ def _scene_given_back(config: Config) -> Iterator[None]:
 def gradcheck(
     experiment: Experiment,
     integrators: str | None = None,
-    budget: float = 45.0,
+    budget: float = 120.0,
     seeds: int | None = None,
     spp: int | None = None,
     allow_code: bool = False,

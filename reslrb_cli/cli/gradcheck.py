@@ -23,6 +23,7 @@ from reslrb_cli.cli.options import (
     allow_code_option,
     allowance,
     check_writable,
+    draws_option,
     is_given,
     json_option,
     optional_experiment_arguments,
@@ -42,10 +43,10 @@ if TYPE_CHECKING:
 
 
 #: Options of comparisons; `--missing` makes none.
-COMPARING = {"suite": "--suite", "integrators": "--integrators"}
+COMPARING = {"suite": "--suite", "integrators": "--integrators", "draws": "--draws"}
 
 #: Options of a configuration; a suite has none but the variant.
-CONFIGURED = {"config_file": "CONFIG", "budget": "--budget", "spp": "--spp"}
+CONFIGURED = {"config_file": "CONFIG", "budget": "--budget", "spp": "--spp", "draws": "--draws"}
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,7 @@ class GradcheckOptions(ExperimentOptions):
     budget: float
     seeds: int | None
     json_file: Path | None
+    draws: Path | None
     spp: int | None
     missing: bool
 
@@ -167,13 +169,14 @@ def _case_line(case: str, rows: list[GradcheckRecord]) -> str:
         "integrators, FILE.py:CLASS[(OPTION=VALUE,...)], which need --allow-code. Default: all four estimators, with "
         "the options of CONFIG, and reslrb:stack(paths=both) if CONFIG leaves the paths open and the scene allows "
         "both.")  # fmt: skip
-@click.option("--budget", type=click.FloatRange(min=0), default=45.0, show_default=True, metavar="SECONDS",
+@click.option("--budget", type=click.FloatRange(min=0), default=120.0, show_default=True, metavar="SECONDS",
               help="Time limit, including loading and compiling. Comparisons with too few seeds by then are "
                    "unresolved.")  # fmt: skip
 @click.option("--seeds", type=click.IntRange(min=3, max=COUNT.max), metavar="N",
               help="Number of seeds, without a time limit. Default: 16.")  # fmt: skip
 @allow_code_option
 @json_option
+@draws_option
 @click.option("--spp", type=COUNT,
               help="Samples per pixel of one gradient. Default: 65536 light paths, at most run.spp.")  # fmt: skip
 @click.option("--missing", is_flag=True,
@@ -190,12 +193,14 @@ def command(**given: Any) -> int:
     """
     began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them
+    from reslrb_cli.measure.draws import DrawsFile
     from reslrb_cli.measure.gradcheck import Gradcheck
     from reslrb_cli.measure.participants import settings_of
     from reslrb_cli.report.tables import summary_lines
 
     options.check()
     check_writable("--json", options.json_file)
+    check_writable("--draws", options.draws)
     if options.suite is not None:
         return run_suite(options)
     config = options.config()
@@ -208,7 +213,7 @@ def command(**given: Any) -> int:
         config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
     )
     variant = set_variant(config.variant)
-    check = Gradcheck(checked)
+    check = Gradcheck(checked, file=DrawsFile(options.draws))
     limit = allowance(options.budget, options.seeds, "seed")
     echo(f"{device_name(variant)}, {variant}; {limit if options.seeds else f'{check.seeds} seeds, {limit}'}")
     echo(check.conditions())

@@ -160,6 +160,12 @@ json_option = click.option(
         "Write one JSON object per line as results come.",
 )  # fmt: skip
 
+#: `--draws` (`draws`) of a command whose draws are kept.
+draws_option = click.option(
+    "--draws", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    help="Keep all draws in FILE (.npz). Draws that FILE has are not drawn again.",
+)  # fmt: skip
+
 #: `--allow-code` (`allow_code`) of a command that runs users' own code.
 allow_code_option = click.option(
     "--allow-code", is_flag=True,

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from reslrb_cli.measure.comparison import (
     compare_expectations,
     entry_count,
 )
+from reslrb_cli.measure.draws import Draws, DrawsFile, Stored
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
@@ -71,14 +73,19 @@ class Row:
 class Gradcheck:
     """Check of one experiment's gradients. `draws` has the samples so far by name: one flat array for each seed.
 
-    The budget starts with the object, and includes loading and compilation. `now` is its clock.
+    Samples that `file` has are not drawn again. The budget starts with the object, and includes loading and
+    compilation. `now` is its clock.
     """
 
-    def __init__(self, settings: CheckSettings, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, settings: CheckSettings, now: Callable[[], float] = time.monotonic, file: DrawsFile | None = None
+    ) -> None:
         self.settings, self._now, self._begin = settings, now, now() - settings.spent_s
         self.seeds, self._budget_s = settings.seeds or SEEDS, settings.budget_s if settings.seeds is None else math.inf
-        self.participants = Participants(settings)
+        self.participants, self.file = Participants(settings), file or DrawsFile()
         self.draws: dict[Name, list[np.ndarray]] = {}
+        self._about: dict[Name, dict[str, Any]] = {}
+        self._on_file: dict[Name, int] = {}
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -123,19 +130,54 @@ class Gradcheck:
 
         A sample that has started is finished. `between` is called after each sample, and `say` from time to time.
         """
+        try:
+            for _ in self._turns(stop, say):
+                between()
+        finally:
+            self._save()
+
+    def _turns(self, stop: Callable[[], bool], say: Callable[[str], None]) -> Iterator[None]:
         names = list(dict.fromkeys(name for row in self.rows for name in self._needs(row)))
+        for name in names:
+            if name not in self.draws:
+                self.draws[name] = self._recall(name)
+        if known := sum(map(len, self.draws.values())):
+            say(f"{known} of {len(names) * self.seeds} samples are on file")
         for number, seed in enumerate(seeds(self.seeds)):
             for name in names:
-                if len(self.draws.setdefault(name, [])) > number:
+                if len(self.draws[name]) > number:
                     continue
                 if stop() or self._now() - self._begin >= self._budget_s:
                     return
-                if name[0] == "differences" and number == 0:
+                if name[0] == "differences" and not self.draws[name]:
                     self.participants.choose_steps(name[1])
                 self.draws[name].append(self.participants.sample(*name, seed).astype(np.float32))
-                between()
+                yield
             if number & (number + 1) == 0:
+                self._save()
                 say(f"{number + 1} of {self.seeds} seeds, {self._now() - self._begin:.0f} s")
+
+    def _recall(self, name: Name) -> list[np.ndarray]:
+        """Return the samples that the file has, and restore the facts that belong to them."""
+        if self.file.path is None:
+            return []
+        self._about[name] = about = self.participants.about(*name)
+        found, stored = self.file.draws(about), self.file.stored(about)
+        if found is None or stored is None or found.seeds.tolist() != list(seeds(len(found))):
+            return []
+        self._on_file[name] = len(found)
+        self.participants.restore(name[1], stored.facts)
+        return list(found.values)[: self.seeds]
+
+    def _save(self) -> None:
+        """Write new samples to the file, with the facts that belong to them."""
+        for name, rows in self.draws.items() if self.file.path is not None else ():
+            if len(rows) > (known := self._on_file.get(name, 0)):
+                about = self._about[name]
+                self.file.add(about, Draws.of(about["purpose"], rows[known:], seeds(len(rows))[known:]))
+                self.file.store(about, Stored(self.participants.facts(name[1]), {}))
+                self._on_file[name] = len(rows)
+        self.file.save()
 
     def records(self, interrupted: bool = False) -> list[GradcheckRecord]:
         """Return the comparisons of the samples so far, in the order of `rows`, and the parameters without a stock

@@ -248,7 +248,8 @@ class Case:
                 values.colours.add(key)
         self.values, self.params = values, values.params
         self.keys = list(keys)
-        self._rounding: dict[str, float] = {}
+        #: Relative rounding errors of the gradients so far by colours, by parameter.
+        self.roundings: dict[str, float] = {}
         self.initial = {key: np.array(values.value(key), dtype=np.float64).ravel() for key in self.keys}
         self.places = places({key: len(row) for key, row in self.initial.items()})
         self.size = sum(map(len, self.initial.values()))
@@ -306,7 +307,7 @@ class Case:
             return
         sums = dr.prod(self.weights.shape[:2]) * spp / PACKET
         for key, condition in self.values.colours.cancellation().items():
-            self._rounding[key] = max(self.rounding(key), 2.0**-24 * np.sqrt(sums) * condition)
+            self.roundings[key] = max(self.rounding(key), 2.0**-24 * np.sqrt(sums) * condition)
 
     def rounding(self, key: str | None = None) -> float:
         """Return the relative error of single precision in the gradients so far by the parameter `key`, or by all.
@@ -316,7 +317,7 @@ class Case:
         are similar, the rounding errors of its partial sums add up to a standard error of about 2^-24 sqrt(k) / 4. Four
         of them are the limit.
         """
-        return max([ROUNDING, *(value for name, value in self._rounding.items() if key in (None, name))])
+        return max([ROUNDING, *(value for name, value in self.roundings.items() if key in (None, name))])
 
     def known_step(self, integrator: Any, scene: Any, sensor: Any, _objective: Any, **options: Any) -> Any:
         """Take a step with dL/dI known before the image, as the `step` argument of `gradient`."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from reslrb_cli.integrators.own import OwnIntegrator, load_estimator
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
+from reslrb_cli.measure.draws import situation
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
 from reslrb_cli.measure.methods import NEVER, NamedIntegrator, all_estimators, parse_checked
 from reslrb_cli.measure.references import (
@@ -27,9 +29,7 @@ from reslrb_cli.measure.references import (
     ends,
     known_gradient,
     of_gradient,
-    path_image,
-    prb_image,
-    ptracer_image,
+    of_image,
 )
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
@@ -176,102 +176,70 @@ class Participants:
     - `images` has the reference of the image for each way. `exact` has gradients in closed form.
     - `listed` has the estimators that take part. If derivatives are attached, only estimators with attached derivatives
         on light paths take part.
+    - `unguided` has the integrator of the unguided steps, by the label of each estimator that a run would or may guide.
+    - `forward_mode` tells whether there is a forward mode. Moving emitters have none.
+    - `masked` tells whether images and their references leave out the film's border.
 
     Raises ConfigError and UnsupportedScene.
     """
 
     def __init__(self, settings: CheckSettings) -> None:
-        config, configs, self.known = settings.config, settings.configs(), settings.known
+        self._config, self._configs, self.known = settings.config, settings.configs(), settings.known
         # If objects move, the experiment has an estimator with derivatives of moving light.
-        follows = [case.type == "reslrb" and case.options["estimator"] in ATTACHED for case in settings.integrators]
-        first = configs[settings.integrators[follows.index(True) if any(follows) else 0].label].with_exposures_fixed()
-        built_in = config.scene.file == small.FILE
-        box = small.build(config.scene.options) if built_in else None
-        problem = assemble_scene(first, box)
-        self.selection = problem.selection
+        follow = [case for case in settings.integrators if case.options.get("estimator") in ATTACHED]
+        first = self._configs[[*follow, *settings.integrators][0].label].with_exposures_fixed()
+        built_in = self._config.scene.file == small.FILE
+        problem = assemble_scene(first, small.build(self._config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
         self.case = Case(scene, problem.selection.keys, sensor, problem.selection)
         self.sensor = scene.sensors()[sensor]
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
-        most = min(PATHS // (self.film[0] * self.film[1]), config.run.spp)  # not more than a step of the run
+        most = min(PATHS // (self.film[0] * self.film[1]), self._config.run.spp)  # not more than a step of the run
         self.spp = settings.spp or multiple_of(max(most, 1), problem.samples_per_pass)
-        options = first.integrator.options()
-        depth = config.integrator.max_depth
         self._situation = Situation.of_problem(problem, sensor)
-        self.attached, moved = self._situation.attached, self._situation.moved
-        #: Whether there is a forward mode; moving emitters have none.
-        nodes = [self.case.params.properties[key][2] for key in moved]
+        self.attached, self._moved = self._situation.attached, self._situation.moved
+        nodes = [self.case.params.properties[key][2] for key in self._moved]
         self.forward_mode = not any(
             isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in nodes
         )
-        self.listed = self._able(settings, configs, problem)
-        shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
-        naive = {"samples_per_pass": options.get("samples_per_pass")}
-        if self.attached:
-            naive |= {"attached": True, "filter_normalization": options.get("filter_normalization", "attached")}
-        light = Way()
+        self.listed = self._able(settings, problem)
         self.ways = {
-            case.label: light if moved and case.type == "reslrb" else Way.of(configs[case.label])
+            case.label: Way() if self._moved and case.type == "reslrb" else Way.of(self._configs[case.label])
             for case in self.listed
         }
         self.each_way = list(dict.fromkeys(self.ways.values()))
-        chosen = config.integrator.options()
-        #: Labels of the estimators whose edges the user has turned off.
-        self._edgeless = {case.label for case in self.listed if (chosen | case.options).get("edges") == "off"}
-        asked = chosen.get("guiding", "off")
-        #: The integrator of the unguided steps, by the label of each estimator that a run would guide or may guide.
-        self.unguided = {
-            label: label if configs[label].integrator.options()["guiding"] == "off" else f"{label}, unguided"
-            for label, case in ((case.label, case) for case in self.listed if case.type == "reslrb")
-            if case.options.get("guiding", asked) != "off" and self.ways[label].paths != "camera"
-        }
-        self.integrators = self._configured({case.label: configs[case.label] for case in self.listed})
-        for way in self.each_way:
-            attached = naive if way.paths == "light" else {**naive, "attached": False}
-            self.integrators |= {
-                way.named("walk_ad"): make_integrator("walk_ad", **shared, **attached, **way.options),
-                # With roulette, differences have heavy tails: sometimes a path ends for only one of the two values.
-                way.named(DIFFERENCED): make_integrator(
-                    "walk_ad", **shared | ({"rr_depth": NEVER} if ends(depth) else {}), **way.options
-                ),
-            }
-        self.integrators |= {
-            "ptracer": make_integrator("ptracer", **shared | {"rr_depth": NEVER}),
-            "prb": make_integrator("prb", **shared),
-            "path": make_integrator("path", **shared),
-        }
+        self.unguided: dict[str, str] = {}
+        self.integrators: dict[str, StepIntegrator] = {}
+        #: The experiment and the options that determine an integrator, by its label.
+        self._origins: dict[str, tuple[Config, dict[str, Any]]] = {}
+        for case in self.listed:
+            self._add_listed(case)
+        self._add_others(first.integrator.options())
         self.stock: dict[str, Reference | None] = {}
         self.why: dict[str, str] = {}
         self.images: dict[Way, tuple[Reference | None, str]] = {}
         self._of: dict[str, tuple[str, Way]] = {}
-        for way in self.each_way:
-            at = replace(self._situation, paths=way.paths)
-            for key in self.case.keys:
-                name = way.named(key)
-                self._of[name] = key, way
-                self.stock[name], self.why[name] = choose(of_gradient(at, key))
-            by_camera = {Reference.PATH: path_image(at), Reference.PRB: prb_image(at)}
-            by_light = {Reference.PTRACER: ptracer_image(at)}
-            self.images[way] = choose(by_camera | by_light if divides_by_film(way.paths) else by_light | by_camera)
+        self._find_references()
         seen = {reference for reference, _ in self.images.values()}
-        #: Whether images and their references leave out the film's border.
         self.masked = self._are_unlike(seen)
         self._weigh(self._are_unlike({*self.stock.values(), *seen}))
         along = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
-        self.directions = {way.named(key): along[key] for way in self.each_way for key in self.case.keys}
+        self.directions = {way.named(key): list(along[key]) for way in self.each_way for key in self.case.keys}
         weights = np.array(self.case.weights, np.float64)
         known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
         self.exact = {key: value for key, value in known.items() if value is not None}
 
-    def _able(self, settings: CheckSettings, configs: dict[str, Config], problem: Problem) -> list[NamedIntegrator]:
+    # --- integrators --------------------------------------------------------------------------------------------------
+
+    def _able(self, settings: CheckSettings, problem: Problem) -> list[NamedIntegrator]:
         """Return the estimators that can take part. Raises ConfigError if an estimator that the user named cannot take
         part, or if no estimator can take part.
         """
         refused: dict[str, ConfigError] = {}
         for case in settings.integrators:
             try:
-                self._check(case, configs[case.label], problem)
+                self._check(case, self._configs[case.label], problem)
             except ConfigError as error:
                 refused[case.label] = error
         listed = [case for case in settings.integrators if case.label not in refused]
@@ -282,7 +250,7 @@ class Participants:
     def _check(self, case: NamedIntegrator, config: Config, problem: Problem) -> None:
         """Raise ConfigError if the estimator cannot render the scene or, if light moves, differentiate it."""
         ours, estimator = case.type == "reslrb", case.options.get("estimator")
-        if not self._situation.moved:
+        if not self._moved:
             check_integrator(config, config.integrator, problem.scene, problem.sensors)
         elif ours and case.options.get("paths", "light") != "light":
             raise ConfigError("--integrators", case.label, "only light paths have derivatives of moving light")
@@ -290,43 +258,55 @@ class Participants:
             reason = f"{estimator} has no derivatives of moving light; use {', '.join(ATTACHED)}"
             raise ConfigError("--integrators", "", reason)
 
-    def _configured(self, configs: dict[str, Config]) -> dict[str, StepIntegrator]:
-        """Return the integrators by label. If derivatives are attached, add variants with the options that references
-        need.
-        """
-        made: dict[str, StepIntegrator] = {}
-        for label, config in configs.items():
-            kind, options = config.integrator.type, config.integrator.options()
-            if kind == "custom":
-                own = OwnIntegrator(**options, allowed=config.allows_code)
-                own.ready()  # before anything is rendered
-                made[label] = own
-                continue
-            if self._situation.moved:  # as in the run
-                options |= {"paths": "light", "light_share": PLAIN["light_share"]}
-            if kind == "reslrb":  # as in a run
-                options["freeze"] = True
-                if (place := getattr(config.integrator, "file", None)) is not None:
-                    load_estimator(place, "--integrators", label)
-            made[label] = make_integrator(kind, **options)
-            if label in self.unguided:
-                made[_alike(label, Reference.UNGUIDED)] = make_integrator(kind, **options | {"guiding": "on"})
-                made.setdefault(self.unguided[label], make_integrator(kind, **options | {"guiding": "off"}))
-            for reference, alike in ALIKE.items() if self.attached else ():
-                alike = alike | {"edges": "off"} if label in self._edgeless else alike
-                if options | alike != options:
-                    made[_alike(label, reference)] = make_integrator(kind, **options | alike)
-        return made
+    def _add(self, label: str, kind: str, config: Config | None = None, **options: Any) -> None:
+        self.integrators[label] = make_integrator(kind, **options)
+        self._origins[label] = config or self._config, {"type": kind} | options
 
-    def references(self, key: str, listed: NamedIntegrator) -> list[Reference]:
-        """Return the references that the scene allows for the gradient of a parameter by an integrator."""
-        if listed.type == "custom" and self._situation.moved:  # our camera paths have no derivatives of moving light
-            return [Reference.FINITE_DIFFERENCE]
-        stock = self.stock[self.ways[listed.label].named(key)]
-        found = [Reference.WALK_AD] + ([] if stock is None else [stock])
-        found += [Reference.ANALYTIC] if key in self.exact else []
-        found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
-        return found + ([Reference.UNGUIDED] if listed.label in self.unguided else [])
+    def _add_listed(self, case: NamedIntegrator) -> None:
+        """Add the integrator of a case, and variants with the options that references need: unguided and guided steps,
+        and other attached derivatives.
+        """
+        label, config = case.label, self._configs[case.label]
+        kind, options = config.integrator.type, config.integrator.options()
+        if kind == "custom":
+            own = OwnIntegrator(**options, allowed=config.allows_code)
+            own.ready()  # before anything is rendered
+            self.integrators[label], self._origins[label] = own, (config, {"type": kind} | options)
+            return
+        guiding, asked = options["guiding"], self._config.integrator.options().get("guiding", "off")
+        if self._moved:  # as in the run
+            options |= {"paths": "light", "light_share": PLAIN["light_share"]}
+        if kind == "reslrb":  # as in a run
+            options["freeze"] = True
+            if (place := getattr(config.integrator, "file", None)) is not None:
+                load_estimator(place, "--integrators", label)
+        self._add(label, kind, config, **options)
+        if case.options.get("guiding", asked) != "off" and self.ways[label].paths != "camera":
+            self.unguided[label] = label if guiding == "off" else f"{label}, unguided"
+            self._add(_alike(label, Reference.UNGUIDED), kind, config, **options | {"guiding": "on"})
+            self._add(self.unguided[label], kind, config, **options | {"guiding": "off"})
+        edgeless = (self._config.integrator.options() | case.options).get("edges") == "off"
+        for reference, alike in ALIKE.items() if self.attached else ():
+            alike = alike | {"edges": "off"} if edgeless else alike
+            if options | alike != options:
+                self._add(_alike(label, reference), kind, config, **options | alike)
+
+    def _add_others(self, options: dict[str, Any]) -> None:
+        """Add naive AD, the integrators of differences, and stock integrators. `options` are those of a run."""
+        shared = {name: options[name] for name in ("max_depth", "rr_depth", "hide_emitters")}
+        # With roulette, differences have heavy tails: sometimes a path ends for only one of the two values.
+        endless = shared | {"rr_depth": NEVER}
+        for way in self.each_way:
+            naive = {"samples_per_pass": options.get("samples_per_pass")}
+            if self.attached:
+                naive["attached"] = way.paths == "light"
+                naive["filter_normalization"] = options.get("filter_normalization", "attached")
+            self._add(way.named("walk_ad"), "walk_ad", **shared, **naive, **way.options)
+            limited = endless if ends(shared["max_depth"]) else shared
+            self._add(way.named(DIFFERENCED), "walk_ad", **limited, **way.options)
+        self._add("ptracer", "ptracer", **endless)
+        self._add("prb", "prb", **shared)
+        self._add("path", "path", **shared)
 
     def sampled(self, label: str, reference: Reference) -> str:
         """Return the label of the integrator that replaces `label` in comparisons with `reference`. `ALIKE` has the
@@ -334,6 +314,28 @@ class Participants:
         """
         alike = _alike(label, reference)
         return alike if alike in self.integrators else label
+
+    # --- references ---------------------------------------------------------------------------------------------------
+
+    def _find_references(self) -> None:
+        """Choose the stock references of images and gradients, by way."""
+        for way in self.each_way:
+            at = replace(self._situation, paths=way.paths)
+            for key in self.case.keys:
+                name = way.named(key)
+                self._of[name] = key, way
+                self.stock[name], self.why[name] = choose(of_gradient(at, key))
+            self.images[way] = choose(of_image(at, (Reference.PTRACER, Reference.PATH, Reference.PRB)))
+
+    def references(self, key: str, listed: NamedIntegrator) -> list[Reference]:
+        """Return the references that the scene allows for the gradient of a parameter by an integrator."""
+        if listed.type == "custom" and self._moved:  # our camera paths have no derivatives of moving light
+            return [Reference.FINITE_DIFFERENCE]
+        stock = self.stock[self.ways[listed.label].named(key)]
+        found = [Reference.WALK_AD] + ([] if stock is None else [stock])
+        found += [Reference.ANALYTIC] if key in self.exact else []
+        found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
+        return found + ([Reference.UNGUIDED] if listed.label in self.unguided else [])
 
     def _are_unlike(self, references: set[Reference | None]) -> bool:
         """Whether some references lose light along the film's border and others do not."""
@@ -346,7 +348,7 @@ class Participants:
         With `inside`, weights are 0 at the border.
         """
         shape = tuple(self.case.weights.shape)
-        if self._situation.moved:
+        if self._moved:
             self.case.weigh(smooth_weights(*shape))
             return
         weights = np.random.default_rng(7).uniform(-0.5, 2.5, shape)
@@ -358,11 +360,40 @@ class Participants:
         """Return the shape of a parameter."""
         return value_shape(self.case.values.value(key))
 
+    # --- samples ------------------------------------------------------------------------------------------------------
+
     def choose_steps(self, of: str) -> None:
         """Choose the finite-difference step for each direction of a parameter. `of` is its name by way."""
-        _, way = self._of[of]
-        image, pilot = self.integrators[way.named(DIFFERENCED)], seeds(PILOT_SEEDS, 9)
+        image, pilot = self.integrators[self._tracer("differences", of)], seeds(PILOT_SEEDS, 9)
         self.directions[of] = [choose_step(self.case, image, d, pilot, self.spp) for d in self.directions[of]]
+
+    def _tracer(self, kind: str, of: str) -> str:
+        """Return the label of the integrator that takes samples (`sample`)."""
+        if kind in ("gradient", "image"):
+            return of
+        _, way = self._of[of]
+        ours = [case.label for case in self.listed if case.type == "reslrb" and self.ways[case.label] == way]
+        return way.named(DIFFERENCED) if kind == "differences" else [*ours, way.named("walk_ad")][0]
+
+    def about(self, kind: str, of: str) -> dict[str, Any]:
+        """Return everything that determines the samples of `kind` and `of`, for a file of draws."""
+        config, options = self._origins[self._tracer(kind, of)]
+        arrays = [np.array(self.case.weights), *(direction.vector for direction in self.directions.get(of, ()))]
+        digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
+        own = {"integrator": options, "spp": self.spp, "known": self.known, "masked": self.masked, "arrays": digest}
+        return situation(config, mi.variant(), purpose=f"gradcheck, {kind} {of}", **own)
+
+    def facts(self, of: str) -> dict[str, Any]:
+        """Return the results that samples of `of` brought about: finite-difference steps, and rounding errors."""
+        steps = [(direction.step, direction.truncation) for direction in self.directions.get(of, ())]
+        return {"steps": steps, "rounding": dict(self.case.roundings)}
+
+    def restore(self, of: str, facts: Mapping[str, Any]) -> None:
+        """Restore the result of `facts`."""
+        for number, (step, truncation) in enumerate(facts["steps"]):
+            self.directions[of][number] = replace(self.directions[of][number], step=step, truncation=truncation)
+        for key, value in facts["rounding"].items():
+            self.case.roundings[key] = max(self.case.rounding(key), value)
 
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
         """Return one sample as a flat array. `kind` is `gradient`, `image`, `differences` or `tangents`.
@@ -373,21 +404,19 @@ class Participants:
         directions. For `differences` and `tangents`, `of` names the parameter and the kinds of paths (`Way.named`).
         Tangents are forward derivatives. All estimators of the same paths have equal tangents.
         """
+        tracer = self.integrators[self._tracer(kind, of)]
         if kind == "gradient":
-            if of in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
-                self._teach(of)
-            return self.gradient(self.integrators[of], seed)
+            self._teach(of)
+            return self.gradient(tracer, seed)
         if kind == "image":
-            image = self.case.image(self.integrators[of], seed, self.spp)
+            image = self.case.image(tracer, seed, self.spp)
             if self.masked:
                 image *= interior(image.shape, self.sensor)[:, :, None]
             return image.ravel()
-        _, way = self._of[of]
         if kind == "differences":
-            tracer, along = self.integrators[way.named(DIFFERENCED)], self.directions[of]
-            return np.array([direction.difference(self.case, tracer, seed, self.spp) for direction in along])
-        ours = [case.label for case in self.listed if case.type == "reslrb" and self.ways[case.label] == way]
-        tracer = self.integrators[ours[0] if ours else way.named("walk_ad")]
+            return np.array(
+                [direction.difference(self.case, tracer, seed, self.spp) for direction in self.directions[of]]
+            )
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
     def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:
@@ -396,9 +425,11 @@ class Participants:
         return self.case.gradient(integrator, seed, self.spp, **options)
 
     def _teach(self, of: str) -> None:
-        """Train the tables of a guided integrator once, then keep the tables. Each sample then depends only on its
-        seed.
+        """Train the tables of the guided steps `of` once, then keep the tables. Each sample then depends only on its
+        seed. Other integrators learn nothing.
         """
+        if of not in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
+            return
         tracer = self.integrators[of]
         assert isinstance(tracer, LightTracer)
         guiding = tracer.preparation.guiding

@@ -11,7 +11,7 @@ form.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,23 +135,23 @@ def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, s
     return next((name for name, reason in reasons.items() if reason is None), None), "; ".join(refused)
 
 
-def of_image(at: Situation) -> dict[Reference, str | None]:
+def of_image(
+    at: Situation, names: Sequence[Reference] = (Reference.PTRACER, Reference.PRB)
+) -> dict[Reference, str | None]:
     """Return the reason against the use of each stock integrator as the image's reference. The reason is None for a
-    valid reference. The integrator that treats the film's border like the estimator comes first.
+    valid reference. Integrators that treat the film's border like the estimator come first, in the order of `names`.
     """
-    return _alike_first(at, {Reference.PTRACER: ptracer_image(at), Reference.PRB: prb_image(at)})
+    reasons = {Reference.PTRACER: ptracer_image, Reference.PATH: path_image, Reference.PRB: prb_image}
+    ordered = sorted(names, key=lambda name: (name in CAMERA_PATHS) != divides_by_film(at.paths))
+    return {name: reasons[name](at) for name in ordered}
 
 
 def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
     """Return the reason against each stock integrator as reference for the gradient with respect to `key`. The
     integrators have the order of `of_image`.
     """
-    return _alike_first(at, {Reference.PTRACER: ptracer_gradient(at, key), Reference.PRB: prb_gradient(at, key)})
-
-
-def _alike_first(at: Situation, reasons: dict[Reference, str | None]) -> dict[Reference, str | None]:
-    ordered = sorted(reasons, key=lambda name: (name in CAMERA_PATHS) != divides_by_film(at.paths))
-    return {name: reasons[name] for name in ordered}
+    reasons = {Reference.PTRACER: ptracer_gradient, Reference.PRB: prb_gradient}
+    return {name: reasons[name](at, key) for name in of_image(at)}
 
 
 def ptracer_image(at: Situation) -> str | None:

@@ -82,6 +82,8 @@ def test_failures_are_named(
         (["--seeds", "2"], "--seeds"),
         (["--json", "/nowhere/a.jsonl"], "--json: cannot write /nowhere/a.jsonl"),
         (["nothing.yaml"], "nothing.yaml: no such file"),
+        (["--missing", "--draws", "a.npz"], "--draws: has no effect with --missing"),
+        (["--suite", "extreme", "--draws", "a.npz"], "--suite: --draws has no effect on a suite"),
         (["--suite", "extrem"], "--suite: there is no suite `extrem`; write extreme, or extreme:CASE"),
         (["--suite", "extreme", "a.yaml"], "--suite: CONFIG has no effect on a suite"),
         (["--suite", "extreme", "--spp", "4"], "--suite: --spp has no effect on a suite"),

@@ -23,6 +23,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import reservoir, stack
 from reslrb_cli.guiding import tables
 from reslrb_cli.integrators import forward
+from reslrb_cli.measure.draws import DrawsFile
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.gradients import (
     Case,
@@ -234,6 +235,33 @@ def test_an_interrupt_compares_the_finished_samples():
     assert list(fresh.run(lambda: True, lambda line: None)) == []
 
 
+@pytest.mark.parametrize("variant", a_few(["llvm_ad_rgb", "llvm_ad_spectral"], ["llvm_ad_rgb"]))
+def test_samples_on_file_are_not_drawn_again(variant: str, tmp_path: Path):
+    """More seeds, and other estimators, draw only what is missing. A complete file gives the same table. Samples of
+    another experiment do not count.
+    """
+    mi.set_variant(variant)
+    file = tmp_path / "draws.npz"
+
+    def records(seeds: int, estimators: str = "stack", *overrides: str) -> tuple[list[GradcheckRecord], int]:
+        small_box = [*SMALL, "scene.options.size=8", f"variant={variant}", *overrides]
+        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, small_box)
+        made = Gradcheck(CheckSettings(config, estimators_of(estimators), 0, seeds), file=DrawsFile(file))
+        taken, right = [], made.participants.sample
+        made.participants.sample = lambda *name: taken.append(name) or right(*name)  # type: ignore[method-assign]
+        return list(made.run(lambda: False, lambda line: None)), len(taken)
+
+    first, taken = records(3)
+    assert taken == 21
+    more, taken = records(4)
+    assert taken == 7
+    assert records(4) == (more, 0)
+    assert records(3) == (first, 0)
+    assert records(4, "stack,event")[1] == 4
+    assert records(4, "stack", "run.spp=16")[1] == 28
+    assert records(4) == (more, 0)
+
+
 def test_estimators_have_the_options_of_the_configuration():
     config = loads(
         small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"]
@@ -325,6 +353,7 @@ def test_images_are_compared_without_the_border(dark):
     case = Case(room(camera=camera("gaussian")), [])
     sensor, integrators = case.scene.sensors()[0], {"walk_ad": integrator("walk_ad", 4)}
     parts = SimpleNamespace(case=case, sensor=sensor, integrators=integrators, masked=dark, spp=16)
+    parts._tracer = lambda kind, of: of
     image = Participants.sample(parts, "image", "walk_ad", 1).reshape(16, 16, 3)
     inside = interior(image.shape, sensor)
     assert (image[~inside] == 0).all() == dark
