@@ -67,6 +67,8 @@ logger = logging.getLogger(__name__)
 #: Dr.Jit records and launches kernels on variables that all threads share. Two threads that work at the same time
 #: disturb each other's recordings, or wait for each other forever.
 _turn = threading.RLock()
+#: Signals that wait for the end of the block that `held` makes.
+_waiting_signals: list[int] = []
 
 
 def end_by(number: int, frame: FrameType | None) -> None:
@@ -76,33 +78,42 @@ def end_by(number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
+def interrupted() -> bool:
+    """Return True if a signal waits for the end of the current block that `held` makes."""
+    return bool(_waiting_signals)
+
+
 @contextlib.contextmanager
 def held() -> Iterator[Callable[[], bool]]:
     """Delay Ctrl-C and a notebook's interrupt until the end of the block, then raise KeyboardInterrupt. The blocks of
     different threads take turns.
 
-    An interrupt inside Mitsuba or Dr.Jit would cause a crash or an unrelated error. Yields a function that returns True
-    if an interrupt is waiting. Long blocks can call the function to stop early. Signals that `end_by` handles are also
-    delayed. Signals are not delayed outside of the main thread, and not again in a nested `held` block.
+    An interrupt inside Mitsuba or Dr.Jit would cause a crash or an unrelated error. Yields `interrupted`. Long blocks
+    can call the function to stop early, also with a KeyboardInterrupt. Signals that `end_by` handles are also delayed.
+    Signals are not delayed outside of the main thread, and not again in a nested `held` block.
     """
     with _turn:
-        if threading.current_thread() is not threading.main_thread():
-            yield lambda: False
-            return
-        before = {number: handler for number in (signal.SIGINT, *KILLING)
-                  if (handler := signal.getsignal(number)) in (signal.default_int_handler, end_by)}  # fmt: skip
-        came: list[int] = []
+        is_main = threading.current_thread() is threading.main_thread()
+        before = {number: handler for number in (signal.SIGINT, *KILLING) if is_main
+                  and (handler := signal.getsignal(number)) in (signal.default_int_handler, end_by)}  # fmt: skip
 
         def mark(number: int, frame: FrameType | None) -> None:
-            came.append(number)
+            _waiting_signals.append(number)
 
         for number in before:
             signal.signal(number, mark)
+        came: list[int] = []
         try:
-            yield lambda: bool(came)
+            yield interrupted
+        except KeyboardInterrupt:
+            if not before or not interrupted():
+                raise
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+            if before:
+                came += _waiting_signals
+                _waiting_signals.clear()
     if came:
         before[came[0]](came[0], None)  # raises
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import drjit as dr
 import numpy as np
 
-from reslrb_cli.api.experiment import KILLING, Experiment, Scene, called, end_by, held, load_with
+from reslrb_cli.api.experiment import KILLING, Experiment, Scene, called, end_by, held, interrupted, load_with
 from reslrb_cli.backend.variant import keep_variant
 from reslrb_cli.config.files import as_path
 from reslrb_cli.config.loader import OVERRIDDEN, Override, overrides_of
@@ -194,7 +194,7 @@ class Run:
                 calls = self._begun.calls(self._callbacks, place.path)
                 recording = Recording(course, place, self._begun.manifest, calls, self._begun.said)
                 try:
-                    yield from recording.records()
+                    yield from recording.records(interrupted)
                     for line in self._begun.manifest.results.get("warnings") or ():
                         logger.warning("%s", line)  # a script prints no last line, as the command does
                 finally:
@@ -434,7 +434,7 @@ def optimize(
                 raise ConfigError("folder", "", error.message) from None
         variant = keep_variant(config.variant, config.source)
         listeners = callbacks_of(config, callbacks, "callbacks")
-        begun = begin(config, variant, logger.info, logger.warning, "" if folder is None else path.name)
+        begun = begin(config, variant, logger.info, logger.warning, "" if folder is None else path.name, interrupted)
         return Run(contextlib.ExitStack(), begun, folder is not None, listeners)
 
 

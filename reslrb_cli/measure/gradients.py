@@ -281,9 +281,12 @@ class Case:
 
     def set(self, values: dict[str, np.ndarray]) -> None:
         """Set parameters from rows of values."""
+        self.values.hand_over(self._all_shaped(values))
+
+    def _all_shaped(self, values: dict[str, np.ndarray]) -> dict[str, Any]:
         shaped = {key: self.shaped(key, value) for key, value in values.items()}
         dr.make_opaque(shaped)
-        self.values.hand_over(shaped)
+        return shaped
 
     def objective(self, image: Any) -> Any:
         """Return sum(image * weights) over the colour channels."""
@@ -293,12 +296,20 @@ class Case:
                  step: Callable = gradient_step, **options: Any) -> np.ndarray:  # fmt: skip
         """Return the gradient of all parameters from one step, as a flat array. `options` are the step's options."""
         leaves = self.leaves()
+        result = self.gradient_of(leaves, integrator, seed, spp, objective, step, **options)
+        self.release(leaves)
+        return result
+
+    def gradient_of(self, leaves: dict[str, Any], integrator: Any, seed: int, spp: int,
+                    objective: Callable | None = None, step: Callable = gradient_step, **options: Any
+                    ) -> np.ndarray:  # fmt: skip
+        """Return the gradient of `leaves` from one step, as a flat array, and clear it. The scene has the `leaves`."""
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
         self._note_rounding(spp)
         self.values.collect()
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
-        self.release(leaves)
+        dr.clear_grad(leaves)
         return np.concatenate(result)
 
     def _note_rounding(self, spp: int) -> None:
@@ -323,17 +334,16 @@ class Case:
         """Take a step with dL/dI known before the image, as the `step` argument of `gradient`."""
         return known_step(integrator, scene, sensor, self.adjoint, **options)
 
-    def leaves(self) -> dict[str, Any]:
-        """Create leaves with derivatives for all parameters, and set them in the scene.
+    def leaves(self, values: dict[str, np.ndarray] | None = None) -> dict[str, Any]:
+        """Create leaves with derivatives for all parameters, and set them in the scene. The leaves have the current
+        values, or rows of `values`.
 
         The leaves are copies, because the scene may replace values by derived values. For example, an environment map
         pads its columns.
         """
-        leaves = {}
-        for key in self.keys:
-            value = self.values.value(key)
-            leaves[key] = type(value)(dr.detach(value))
-            dr.enable_grad(leaves[key])
+        now = {key: self.values.value(key) for key in self.keys} if values is None else self._all_shaped(values)
+        leaves = {key: type(value)(dr.detach(value)) for key, value in now.items()}
+        dr.enable_grad(leaves)
         self.values.hand_over({key: type(leaf)(leaf) for key, leaf in leaves.items()})
         return leaves
 

@@ -89,18 +89,21 @@ class Tracing:
     """Images and gradients at values along segments, for one case per view.
 
     `images` and `gradients` are the integrators. `spent` counts the samples per pixel of images and gradients.
+    `before` is called before each image and gradient, and may raise. A move of a large mesh takes longer than an image.
+    Everything that needs one place is therefore rendered after one move.
     """
 
     cases: Sequence[Case]
     images: Any
     gradients: Any
     spp: int
+    before: Callable[[], None] = lambda: None
     spent: int = 0
 
-    def move(self, vector: np.ndarray, s: float) -> None:
-        """Set the scene's values to x + s `vector`."""
+    def values(self, vector: np.ndarray, s: float) -> dict[str, np.ndarray]:
+        """Return the values x + s `vector` by parameter."""
         case = self.cases[0]
-        case.set({key: case.initial[key] + s * vector[at] for key, at in case.places.items()})
+        return {key: case.initial[key] + s * vector[at] for key, at in case.places.items()}
 
     def segment(self, direction: Direction, trials: int = 4) -> LineSegment:
         """Return a segment without weights. Up to `trials` lengths are tried, until the image changes by about `AIM`
@@ -127,15 +130,16 @@ class Tracing:
 
     def _see(self, vector: np.ndarray, s: float, seeds: Sequence[int]) -> list[list[np.ndarray]]:
         """Return the images (H, W, C) of all views at x + s `vector`, for each seed."""
-        self.move(vector, s)
+        self.cases[0].set(self.values(vector, s))
         self.spent += self.spp * len(seeds)
-        return [[case.image(self.images, seed, self.spp) for case in self.cases] for seed in seeds]
+        found = []
+        for seed in seeds:
+            self.before()
+            found.append([case.image(self.images, seed, self.spp) for case in self.cases])
+        return found
 
     def sample(self, segment: LineSegment, seeds: Sequence[int]) -> np.ndarray:
-        """Return the difference along a segment and the gradient at a random point of it, for each seed: (N, 2).
-
-        All images of an end are rendered together, because a move may build the scene anew.
-        """
+        """Return the difference along a segment and the gradient at a random point of it, for each seed: (N, 2)."""
         found = np.zeros((len(seeds), 2))
         for s, sign in ((segment.high, 1), (segment.low, -1)):
             for row, images in zip(found, self._see(segment.vector, s, seeds), strict=True):
@@ -143,11 +147,13 @@ class Tracing:
                 row[0] += sign * sum(float(np.sum(image * weights)) for image, weights in pairs)
         found[:, 0] /= segment.high - segment.low
         for row, seed in zip(found, seeds, strict=True):
-            self.move(segment.vector, np.random.default_rng(seed).uniform(segment.low, segment.high))
+            self.before()
+            at = np.random.default_rng(seed).uniform(segment.low, segment.high)
+            leaves = self.cases[0].leaves(self.values(segment.vector, at))
             self.spent += self.spp
             for case, weights in zip(self.cases, segment.weights, strict=True):
                 case.weigh(weights)
-                gradient = case.gradient(self.gradients, seed, self.spp, step=case.known_step)
+                gradient = case.gradient_of(leaves, self.gradients, seed, self.spp, step=case.known_step)
                 row[1] += float(segment.vector @ gradient)
         return found
 
@@ -155,7 +161,8 @@ class Tracing:
         """Return the segment with the weights dL/dI at its end with the higher loss."""
         found: list[tuple[float, list[np.ndarray]]] = []
         for s in (segment.high, segment.low):
-            self.move(segment.vector, s)
+            self.cases[0].set(self.values(segment.vector, s))
+            self.before()
             self.spent += spp
             loss, weights = 0.0, []
             for case, view in zip(self.cases, views, strict=True):
@@ -419,7 +426,7 @@ class _Short:
         self._views = problem.trained[:MOST_VIEWS]
         cases = [Case(problem.scene, keys, view.sensor, problem.selection) for view in self._views]
         spp = min(max(run.spp // 16, 1), problem.samples_per_pass or run.spp)
-        self.tracing = Tracing(cases, integrator, integrator, spp)
+        self.tracing = Tracing(cases, integrator, integrator, spp, problem.stop_if_interrupted)
         self._limit = run.measuring * run.iterations * run.spp * len(problem.drawn(0)) / len(self._views)
         sizes = [_size(item.node.bbox()) for item in where_moved(self._params, problem.selection.scene_keys)
                  if item.is_shape]  # fmt: skip

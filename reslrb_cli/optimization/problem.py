@@ -126,6 +126,8 @@ class Problem:
     regularizers: dict[str, dict[str, Cost]] = field(default_factory=dict)
     #: Computes the shards of a step (`shards.Engine`); None: this process, one by one.
     engine: Callable[..., Any] | None = None
+    #: True if an interrupt waits. Long measurements ask between two renderings (`stop_if_interrupted`).
+    interrupted: Callable[[], bool] = lambda: False
     #: Numbers of non-finite entries that measurements left out since the last iteration, by image or gradient.
     left_out: Counter[str] = field(default_factory=Counter)
 
@@ -135,6 +137,11 @@ class Problem:
         if count := int(np.count_nonzero(~known)):
             self.left_out[name] += count
         return np.where(known, values, np.nan)
+
+    def stop_if_interrupted(self) -> None:
+        """Raise KeyboardInterrupt if an interrupt waits."""
+        if self.interrupted():
+            raise KeyboardInterrupt
 
     def take_left_out(self) -> dict[str, int]:
         """Return the numbers of values that measurements left out, and clear them."""

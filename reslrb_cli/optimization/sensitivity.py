@@ -105,7 +105,8 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
     """Measure the steepest curvature of all parameters and return it. Gradient descent then scales each parameter's
     steps by the inverse of the measured curvature.
 
-    A parameter without an effect on the image keeps its units.
+    A parameter without an effect on the image keeps its units. An interrupt stops the measurement before the next
+    rendering (`Problem.stop_if_interrupted`). The values are then not those of the start.
     """
     optimizer, measured = problem.optimizer, []
     starts = {key: dr.detach(optimizer[key]) for key in problem.selection.keys}
@@ -147,6 +148,7 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
     for _ in range(TRIALS):
         images, (pair, wide) = [], ends()
         for end in pair:
+            problem.stop_if_interrupted()
             problem.apply({key: variable.to_scene(end)})
             images.append(see_images(problem))
         halves = (0.5 * finite(a - b) for a, b in zip(*images, strict=True))
@@ -179,6 +181,7 @@ def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
     """Return dL/dv as a flat array, at the value `v` of the optimiser's variable for `key`. Every call uses the same
     samples. Values that are not finite are NaN.
     """
+    problem.stop_if_interrupted()
     optimizer = problem.optimizer
     variable = optimizer.variable(key)
     optimizer.set_value(key, variable.to_scene(v))

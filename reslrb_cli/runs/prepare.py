@@ -123,12 +123,14 @@ def _shown(value: Any) -> str:
 Say = Callable[[str], None]
 
 
-def prepare(config: Config, variant: str, say: Say, warn: Say) -> tuple[RunProgress, Manifest]:
+def prepare(config: Config, variant: str, say: Say, warn: Say, interrupted: Callable[[], bool] = lambda: False
+            ) -> tuple[RunProgress, Manifest]:  # fmt: skip
     """Assemble a new run and make the measurements before its first iteration. A variant must be set.
 
-    `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene.
+    `say` is called with lines about slow steps, `warn` with warnings. Raises ConfigError and UnsupportedScene, and
+    KeyboardInterrupt soon after `interrupted()` is true.
     """
-    problem = assemble(config, say, DecisionCache(), to_run=True)
+    problem = replace(assemble(config, say, DecisionCache(), to_run=True), interrupted=interrupted)
     problem, missing = check_missing(problem, say, warn)
     if missing:  # the check moves geometry, possibly beyond the bounding sphere of the lamps at infinity
         problem = problem.afresh(problem.values())
@@ -221,6 +223,10 @@ class RunProgress:
         self.certainty = Certainty(problem)
         self.nonfinite, self.regularized = NonFiniteTally(), RegularizedTally()
         self.last: Record | None = None
+
+    def stop_when(self, interrupted: Callable[[], bool]) -> None:
+        """Stop long measurements soon after `interrupted()` is true."""
+        self.problem = replace(self.problem, interrupted=interrupted)
 
     def compute_with(self, engine: Callable[..., Any]) -> None:
         """Let `engine` (`shards.Engine`) compute the shards of a step."""
@@ -330,13 +336,17 @@ class PreparedRun:
         return Calls(callbacks, run, self.manifest)
 
 
-def begin(config: Config, variant: str, say: Say, warn: Say, folder: str = "") -> PreparedRun:
+def begin(
+    config: Config, variant: str, say: Say, warn: Say, folder: str = "",
+    interrupted: Callable[[], bool] = lambda: False,
+) -> PreparedRun:  # fmt: skip
     """Prepare a new run in its own folder, which `folder` names, or else `run.name`. A variant must be set.
 
-    Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene.
+    Call `check_output` first, to check that the folder can be made. Raises ConfigError and UnsupportedScene, and
+    KeyboardInterrupt soon after `interrupted()` is true.
     """
     with collected() as said:
-        course, manifest = prepare(config, variant, say, warn)
+        course, manifest = prepare(config, variant, say, warn, interrupted)
     run = config.run
     return PreparedRun(
         course,

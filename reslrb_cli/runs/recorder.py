@@ -66,7 +66,6 @@ class Recording:
     _saved: int | None = None
 
     def __post_init__(self) -> None:
-        self._stop: Callable[[], bool] = lambda: False
         self.page = LivePage(self._write_live_page)
 
     @property
@@ -96,12 +95,13 @@ class Recording:
     def records(self, stop: Callable[[], bool] = lambda: False) -> Generator[Record, None, None]:
         """Yield the record of each iteration, then complete the folder and set `status`. Write the log file.
 
-        Iteration stops at the last iteration, when `stop()` is true, or when the generator is closed. In all cases, the
-        folder finally has a checkpoint, the parameters, the report, and a manifest with the outcome. If the run did not
-        fail, the folder also has the final images. Raises the error that ended the run. The error is a MachineError if
-        the run could not write to the folder.
+        Iteration stops at the last iteration, when `stop()` is true, or when the generator is closed. `stop()` also
+        stops measurements for `scale: curvature`. In all cases, the folder finally has a checkpoint, the parameters,
+        the report, and a manifest with the outcome. If the run did not fail, the folder also has the final images.
+        Raises the error that ended the run. The error is a MachineError if the run could not write to the folder.
         """
-        records = self._records(stop)
+        self.course.stop_when(stop)
+        records = self._records()
         advance: Callable[[], Record] = records.__next__
         left = f"{self.problem.config.run.iterations - self.done} iterations of {self.manifest.config}"
         append_log(self.folder, [*self.said, log_line(f"begins {left}")])
@@ -124,8 +124,7 @@ class Recording:
             else:
                 advance = records.__next__
 
-    def _records(self, stop: Callable[[], bool]) -> Generator[Record, None, None]:
-        self._stop = stop
+    def _records(self) -> Generator[Record, None, None]:
         status: Status = Status.FAILED
         failure: BaseException | None = None
         try:
@@ -137,7 +136,7 @@ class Recording:
                 self._begin()
             (self.folder.path / FABRICATION_FILE).unlink(missing_ok=True)  # outdated once the run goes on
             with contextlib.suppress(GeneratorExit):
-                yield from self._iterate(stop)
+                yield from self._iterate()
             left = self.done < self.problem.config.run.iterations and not self.course.state.stopped
             status = Status.INTERRUPTED if left else Status.FINISHED
         except KeyboardInterrupt:
@@ -168,10 +167,10 @@ class Recording:
         for key, mask in problem.masks.items():
             write_mask(parameters, key, mask)
 
-    def _iterate(self, stop: Callable[[], bool]) -> Iterator[Record]:
+    def _iterate(self) -> Iterator[Record]:
         run, saved, saved_at = self.problem.config.run, self.done, time.monotonic()
         told = self.course.state.scaling
-        if stop():
+        if self.problem.interrupted():
             return
         with MetricsWriter(self.folder.path) as metrics:
             for state, record in self._iterations():
@@ -184,7 +183,7 @@ class Recording:
                 yield record
                 if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
                     raise fault
-                if stop():
+                if self.problem.interrupted():
                     return
                 if run.checkpoint_every.is_due(self.done - saved, time.monotonic() - saved_at):
                     metrics.sync()
@@ -284,7 +283,7 @@ class Recording:
             self.unmeasured.append("the certainty of the values was not measured: it needs a loss of separate pixels")
             return
         logger.info("measuring the certainty of the values")
-        measured = self.course.certainty.measure(self.done, last.elapsed_s, self._stop)
+        measured = self.course.certainty.measure(self.done, last.elapsed_s, self.problem.interrupted)
         self.certainty = measured and measured.without_derivatives(
             [record.parameter for record in incomplete_records(self.manifest.incomplete)]
         )

@@ -24,7 +24,8 @@ from runs.going_on import TIMES, begin_alone, differences, optimize, records_of
 
 import reslrb_cli as rl
 from reslrb_cli.api import experiment as experiment_module
-from reslrb_cli.errors import MachineError, NonFinite
+from reslrb_cli.errors import ExitCode, MachineError, NonFinite
+from reslrb_cli.optimization import sensitivity
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.runs import recorder as recording
 
@@ -91,6 +92,49 @@ def test_a_loop_gives_the_results_of_the_command(experiment: Path, settings: dic
     assert values_equal(alone.parameters, dict(np.load("runs/tiny/parameters/parameters.npz")))
     assert (alone.folder, alone.status) == (None, "finished")
     assert files(Path("runs")) == {f"{name}/{file}" for name in ("tiny", "mine") for file in files(run.folder)}
+
+
+#: `scale: curvature` measures gradients before the first iteration.
+DESCENT: dict[str, Any] = SET | {"optimizer": {"type": "sgd", "scale": "curvature"}}
+
+
+def signal_at_a_gradient(patch: pytest.MonkeyPatch, number: int) -> list[Any]:
+    """Send the signal `number` during the third gradient that is measured. Returns the arguments of the gradients."""
+    real, seen = sensitivity.sample_gradient, list[Any]()
+
+    def measured(*given: Any) -> Any:
+        seen.append(given)
+        if len(seen) == 3:
+            os.kill(os.getpid(), number)
+        return real(*given)
+
+    patch.setattr(sensitivity, "sample_gradient", measured)
+    return seen
+
+
+def test_a_signal_stops_the_measurement_of_curvature(experiment: Path) -> None:
+    """With large lenses, the measurement takes a minute. The command, a loop with a folder, and a loop without one stop
+    after the current gradient. The runs then continue as if there had been no signal.
+    """
+    sets = [word for key, value in DESCENT.items() for word in ("--set", f"{key}={json.dumps(value)}")]
+    assert optimize("tiny.yaml", "--quiet", *sets, "--set", "run.name=whole") == 0
+    with pytest.MonkeyPatch.context() as patch:
+        seen = signal_at_a_gradient(patch, signal.SIGTERM)
+        assert optimize("tiny.yaml", "--quiet", *sets, "--set", "run.name=part") == ExitCode.INTERRUPTED
+    assert len(seen) == 3
+    runs = [rl.optimize("tiny.yaml", folder, overrides=DESCENT) for folder in ("runs/loop", None)]
+    for run, number, error in zip(runs, (signal.SIGINT, signal.SIGTERM), (KeyboardInterrupt, SystemExit), strict=True):
+        with pytest.MonkeyPatch.context() as patch:
+            seen = signal_at_a_gradient(patch, number)
+            with pytest.raises(error):
+                list(run)
+        assert (len(seen), run.status, run.iteration) == (3, "interrupted", 0)
+    for folder in (Path("runs/part"), Path("runs/loop")):
+        assert status_of(folder) == "interrupted"
+        assert files(folder) >= tiny.COMPLETE - {"metrics.jsonl"}
+        assert optimize("--resume", str(folder), "--quiet") == 0
+        assert records_of(folder) == records_of(Path("runs/whole"))
+    assert [as_json(record) for record in runs[1]] == records_of(Path("runs/whole"))
 
 
 def test_everything_can_be_inspected_between_iterations(experiment: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +17,7 @@ from kit import area, diffuse, scene, sensor, shape
 from optimization import glass
 from scipy import stats
 
+import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure import missing
 from reslrb_cli.measure.gradients import Case, Direction
@@ -24,6 +27,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.records.measurements import ALARM, MissingRecord, student
 from reslrb_cli.report.run_summary import find_remedy, warnings
+from reslrb_cli.scene.parameters import Selection
 
 #: A box on a floor under an area lamp, seen from above. Runs recover the box's place from an image that `path`
 #: rendered.
@@ -147,7 +151,7 @@ def test_the_measurement_stays_within_its_samples(experiment: Path, monkeypatch:
     problem, taken = assemble(load(experiment, [f"run.measuring={measuring}"])), []
     random = np.random.default_rng(1)
 
-    def gradient(case: Case, tracer: Any, seed: int, spp: int, step: Any) -> np.ndarray:
+    def gradient(case: Case, leaves: Any, tracer: Any, seed: int, spp: int, step: Any) -> np.ndarray:
         taken.append(spp)
         return random.normal(size=case.size)
 
@@ -161,12 +165,71 @@ def test_the_measurement_stays_within_its_samples(experiment: Path, monkeypatch:
         taken.append(spp)
         return render(problem, sensor, spp, iteration, purpose)
 
-    monkeypatch.setattr(Case, "gradient", gradient)
+    monkeypatch.setattr(Case, "gradient_of", gradient)
     monkeypatch.setattr(Case, "image", see)
     monkeypatch.setattr(Problem, "render", image)
     assert not any(record.is_decided for record in measure_missing(problem))
     allowed = measuring * problem.config.run.iterations * problem.config.run.spp
     assert 0.7 * allowed < sum(taken) <= allowed
+
+
+def test_the_scene_moves_once_for_each_place(experiment: Path, monkeypatch: pytest.MonkeyPatch):
+    """A move of a large mesh takes longer than an image. Gradients of several views need only one move."""
+    problem = assemble(load(experiment, ["parameters=[{motion: {of: box, free: [x, z]}}]"]))
+    short, moves = _Short(problem, ["box.x", "box.z"]), list[Any]()
+    [case] = short.tracing.cases
+    expected = case.gradient(short.tracing.gradients, 3, 4, step=case.known_step)
+    short.tracing.cases = [case, Case(problem.scene, short.keys, 0, problem.selection)]
+    hand_over = Selection.hand_over
+
+    def counted(selection: Selection, values: Any) -> None:
+        moves.append(values)
+        hand_over(selection, values)
+
+    monkeypatch.setattr(Selection, "hand_over", counted)
+    leaves = case.leaves(case.initial)
+    for _ in range(2):
+        found = case.gradient_of(leaves, short.tracing.gradients, 3, 4, step=case.known_step)
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert len(moves) == 1
+    segments = [LineSegment(np.eye(2)[k], -0.1, 0.1, [np.array(case.weights)] * 2) for k in (0, 1)]
+    Missing(segments).take(short.tracing, range(3))
+    assert len(moves) == 1 + 2 * (2 + 3)
+
+
+@pytest.mark.parametrize("count", [0, 5, 9])
+def test_an_interrupt_stops_the_measurement_at_once(experiment: Path, monkeypatch: pytest.MonkeyPatch, count: int):
+    """The interrupt comes after `count` images and gradients."""
+    problem, taken = assemble(load(experiment, [])), list[Any]()
+    before = {key: value.copy() for key, value in problem.values().items()}
+
+    def seen(case: Case, *_: Any, **__: Any) -> np.ndarray:
+        taken.append(case)
+        return np.ones(case.weights.shape)
+
+    monkeypatch.setattr(Case, "image", seen)
+    monkeypatch.setattr(Case, "gradient_of", lambda *_, **__: seen(*_)[0, 0, :2])
+    with pytest.raises(KeyboardInterrupt):
+        measure_missing(replace(problem, interrupted=lambda: len(taken) >= count))
+    assert len(taken) == count
+    assert {key: value.tolist() for key, value in problem.values().items()} == {
+        key: value.tolist() for key, value in before.items()
+    }
+
+
+def test_an_interrupt_stops_a_script_during_the_measurement(experiment: Path, monkeypatch: pytest.MonkeyPatch):
+    image, taken = Case.image, list[Case]()
+
+    def seen(case: Case, *given: Any) -> np.ndarray:
+        taken.append(case)
+        os.kill(os.getpid(), signal.SIGINT)
+        return image(case, *given)
+
+    monkeypatch.setattr(Case, "image", seen)
+    with pytest.raises(KeyboardInterrupt):
+        rl.optimize(experiment, folder=experiment.parent / "stopped")
+    assert len(taken) == 1
+    assert not (experiment.parent / "stopped").exists()
 
 
 def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path):
@@ -252,10 +315,11 @@ def test_weights_belong_to_the_end_with_the_higher_loss(llvm: str):
     """There, the derivative of the loss does not vanish, whichever end is nearer to the target at -1."""
 
     class Along(Tracing):
-        def move(self, vector: np.ndarray, s: float) -> None:
+        def values(self, vector: np.ndarray, s: float) -> dict[str, np.ndarray]:
             self.at = s
+            return {}
 
-    case: Any = SimpleNamespace(weights=np.zeros((1, 1, 1)))
+    case: Any = SimpleNamespace(weights=np.zeros((1, 1, 1)), set=lambda values: None)
     view: Any = SimpleNamespace(
         sensor=0, share=1.0, follow=lambda scene: None, compare=lambda image: [np.square(np.array(image) + 1).sum()]
     )
@@ -291,15 +355,16 @@ def test_long_segments_have_no_truncation_error():
     """The loss bends within the segment. The gradient is complete, so nothing is missing, whatever the length."""
 
     class Bent(Tracing):
-        def move(self, vector: np.ndarray, s: float) -> None:
+        def values(self, vector: np.ndarray, s: float) -> dict[str, np.ndarray]:
             self.at = s
+            return {}
 
         def _see(self, vector: np.ndarray, s: float, seeds: Sequence[int]) -> list[list[np.ndarray]]:
             return [[np.array([np.sin(3 * s)])]] * len(seeds)
 
     case: Any = SimpleNamespace(
-        weigh=lambda weights: None, known_step=None,
-        gradient=lambda *_, **__: np.array([3 * np.cos(3 * bent.at)]),
+        weigh=lambda weights: None, known_step=None, leaves=lambda values: values,
+        gradient_of=lambda *_, **__: np.array([3 * np.cos(3 * bent.at)]),
     )  # fmt: skip
     bent = Bent([case], None, None, 1)
     found = Missing([LineSegment(np.ones(1), -0.1, 0.5, [np.ones(1)])])
