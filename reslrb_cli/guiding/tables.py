@@ -36,16 +36,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.guiding.collect import KEEP, NAMES, Collected, Onward
+from reslrb_cli.guiding.collect import Collected
 from reslrb_cli.transport.aim import AIM_SLOTS, BLOCKS, Aim, Blocks
 from reslrb_cli.transport.emission import used_numbers
-from reslrb_cli.transport.factors import CELLS, Survival, box_of
 from reslrb_cli.transport.plan import Grid
 from reslrb_cli.transport.samples import Samples, Table
 
 Array = np.ndarray[Any, Any]
 
 GUIDE_UNIFORM = 0.25  # minimum share of paths with uniform starts
+KEEP = 0.75  # weight of the past relative to the newest walk
 CELL_BITS = 19  # cells of all emitters together, log2
 MOST_EMITTERS = 1024  # with their own cells; among more emitters, neighbours share cells
 
@@ -106,7 +106,6 @@ class Learned:
     Arrays are float32, and never modified.
 
     - `calls` is the number of gradients so far. The count restarts when a table is found to be wrong.
-    - `onward` has the later contributions for each position. `onward` is None if they are unknown.
     - `worse` is the mean square contribution of the newest paths divided by the mean square contribution of uniform
         paths. If `worse` is far above 1, the table is harmful, for example after a change of the scene.
     - `film` (2, blocks) has the sums of squares for each block of the film (`transport/aim.py`). There are no blocks if
@@ -116,7 +115,6 @@ class Learned:
     sums: Array
     draws: Array
     calls: int = 0
-    onward: Onward | None = None
     film: Array = field(default_factory=lambda: np.zeros((2, 0), np.float32))
     worse: float = 1.0
     _densities: tuple[Grid, list[Array]] | None = field(default=None, init=False, repr=False, compare=False)
@@ -126,14 +124,11 @@ class Learned:
         """Return the state before the first gradient."""
         return Learned(np.zeros((2, grid.cells), np.float32), np.zeros(grid.cells, np.float32))
 
-    def with_more(
-        self, grid: Grid, newer: Array, draws: Array, onward: Onward | None = None, film: Array | None = None
-    ) -> Learned:
+    def with_more(self, grid: Grid, newer: Array, draws: Array, film: Array | None = None) -> Learned:
         """Return the state after newer paths.
 
         `newer` (quantities, cells) holds the contributions of the newer paths, with the image last. `draws` (cells)
-        holds the number of newer paths per cell. Each quantity is scaled to a total of 1. `onward` already includes the
-        newer paths.
+        holds the number of newer paths per cell. Each quantity is scaled to a total of 1.
         """
         sums = np.float32(KEEP) * self.sums
         means = np.zeros(grid.cells, np.float32)
@@ -142,7 +137,7 @@ class Learned:
         started = np.float32(KEEP) * self.draws
         started += draws
         worse = float(draws.sum() * np.mean(guided)) if guided else 1.0
-        return Learned(sums, started, self.calls, onward, self._places(film), worse)
+        return Learned(sums, started, self.calls, self._places(film), worse)
 
     def _places(self, newer: Array | None) -> Array:
         """Return `film`, updated with the newer contributions to each block (quantities, blocks). The last row belongs
@@ -159,7 +154,7 @@ class Learned:
         """Return the contributions, distributed evenly over the cells of another grid."""
         sums = np.stack([grid.shared_out(row, before) for row in self.sums])
         draws = grid.shared_out(self.draws, before).astype(np.float32)
-        return Learned(sums.astype(np.float32), draws, self.calls, self.onward, self.film)
+        return Learned(sums.astype(np.float32), draws, self.calls, self.film)
 
     def density(self, grid: Grid, share: float) -> Array:
         """Return the normalised density of the cells (cells,), before the uniform part is added.
@@ -222,7 +217,7 @@ NOW = 0.2  # share of the paths of a gradient that use its own dL/dI, if known; 
 LEARNING_STREAM = 0x1EA2  # seeds of the samples that tables learn from
 
 #: Names of the arrays of each sensor in the learned state.
-KNOWN = ("sums", "draws", "film", *NAMES)
+KNOWN = ("sums", "draws", "film")
 
 
 class Purpose(enum.Enum):
@@ -241,7 +236,7 @@ def sensor_bytes(grid: Grid, aims: bool = True) -> int:
     """
     emission = len(Purpose) * (grid.slots + 2 * grid.cells) + 3 * grid.cells
     aim = (len(Purpose) + 1) * (AIM_SLOTS + BLOCKS) + 2 * BLOCKS
-    return 4 * (emission + (len(Purpose) + 4) * CELLS + (aim if aims else 0))
+    return 4 * (emission + (aim if aims else 0))
 
 
 def grid_for(used: Sequence[bool], weights: Sequence[float], sensors: int, paths: int | None = None) -> Grid:
@@ -265,7 +260,6 @@ class Guiding:
         self.held, self.lessons = False, 0
         self.grid: Grid | None = None
         self._emission: tuple[list[bool], list[float], int] | None = None  # scene data that `grid_for` needs
-        self.box = np.zeros((2, 3), np.float32)  # of the scene, as first seen
         self.learned: dict[int, Learned] = {}  # by the number of the sensor
         self.films: dict[int, Blocks] = {}  # of sensors with paths that may be aimed
         self._tables: dict[tuple[int, Purpose], tuple[Table, Array]] = {}
@@ -290,7 +284,6 @@ class Guiding:
         if self._emission is None:
             weights = [float(emitter.sampling_weight()) for emitter in samples.scene.emitters()]
             self._emission = used_numbers(samples), weights, len(samples.scene.sensors())
-            self.box = box_of(samples.scene)
         before, self.grid = self.grid, grid_for(*self._emission, paths)
         if before is not None and before != self.grid:
             kept = {number: one for number, one in self.learned.items() if number == self._shared(number)}
@@ -321,10 +314,8 @@ class Guiding:
             learned = self.learned.get(number)
             density = self.grid.measures() if learned is None else learned.density(self.grid, purpose.value)
             counts = apportion(self.grid, density).astype(np.uint32)
-            onward = self._onward(number)
-            survival = Survival.of(onward.box, onward.chances(purpose.value))
             aim = self._aim(number, purpose, learned)
-            self._tables[number, purpose] = Table.of(self.grid, counts, survival, aim), counts
+            self._tables[number, purpose] = Table.of(self.grid, counts, aim), counts
         return self._tables[number, purpose]
 
     def aims(self, number: int, film: Blocks) -> bool:
@@ -353,11 +344,6 @@ class Guiding:
             gradient = (1 - NOW) * gradient + NOW * _shares(film.root_means(delta), even)
         return Aim.of(film, purpose.value * gradient + (1 - purpose.value) * image)
 
-    def _onward(self, number: int) -> Onward:
-        """Return the later contributions by position. `number` is the sensor that owns the tables."""
-        learned = self.learned.get(number)
-        return Onward.nothing(self.box) if learned is None or learned.onward is None else learned.onward
-
     def _shared(self, number: int) -> int:
         """Return the number of the sensor whose tables this sensor uses."""
         return number % self._apart
@@ -374,8 +360,7 @@ class Guiding:
         """
         arrays: dict[str, Array] = {}
         for number, learned in self.learned.items():
-            found = {name: getattr(learned, name) for name in ("sums", "draws", "film")}
-            arrays |= {f"{number}/{name}": array for name, array in (found | self._onward(number).arrays()).items()}
+            arrays |= {f"{number}/{name}": getattr(learned, name) for name in KNOWN}
         return {str(number): learned.calls for number, learned in self.learned.items()}, arrays
 
     def restore(self, calls: Mapping[str, int], take: Callable[[str], Array]) -> str | None:
@@ -391,11 +376,8 @@ class Guiding:
             for name, shape in shapes.items():
                 if arrays[name].shape != shape or not (np.isfinite(arrays[name]) & (arrays[name] >= 0)).all():
                     return f"{number}/{name}"
-            onward = Onward.taken(arrays)
-            if isinstance(onward, str):
-                return f"{number}/{onward}"
             sums, draws, film = (arrays[name].astype(np.float32) for name in shapes)
-            found[int(number)] = Learned(sums, draws, count, onward, film)
+            found[int(number)] = Learned(sums, draws, count, film)
         self.learned, self._tables = found, {}
         return None
 
@@ -420,10 +402,9 @@ class Guiding:
         if before is None:
             before = Learned.nothing(self.grid)
             before.calls = 1
-        onward = self._onward(number).with_more(collected, paths)
         newer, draws = np.array(collected.starts).reshape(-1, self.grid.cells), paths * (counts / self.grid.slots)
         film = np.array(collected.places[0]).reshape(len(newer), -1) if collected.places else None
-        learned = before.with_more(self.grid, newer, draws, onward, film)
+        learned = before.with_more(self.grid, newer, draws, film)
         if learned.worse > WRONG and learned.calls % EVERY == 0:
             learned.calls = 0  # the scene has changed, so it learns as often as at the start
         self.learned[number] = learned

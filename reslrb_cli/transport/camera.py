@@ -306,7 +306,7 @@ def camera_walk(
         number = sampler.next_1d(active)
         if plan.roulette:
             throughput = dr.max(dr.abs(product.magnitude()))
-            survives, factor = play(plan, None, path.depth, throughput, eta, si.p, scattering.d, number)
+            survives, factor = play(plan, path.depth, throughput, eta, number)
             active &= survives
             product, state = product.scaled(factor), hooks.survived(state, factor)
 

@@ -207,13 +207,8 @@ class Plan:
 
     @property
     def roulette(self) -> bool:
-        """Whether roulette on throughput can end a path before the depth limit."""
+        """Whether roulette can end a path before the depth limit."""
         return self.rr_depth < self.max_depth - 1
-
-    @property
-    def plays_roulette(self) -> bool:
-        """Whether light paths use Russian roulette: on throughput, or the learned roulette of guided paths."""
-        return self.roulette or self.grid is not None
 
     @property
     def visible_emission(self) -> bool:

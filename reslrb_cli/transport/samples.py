@@ -26,7 +26,6 @@ from reslrb_cli.scene.graph import Lamp
 from reslrb_cli.transport.aim import Aim
 from reslrb_cli.transport.bsdf import EventNumbers
 from reslrb_cli.transport.densities import EmitterDensities
-from reslrb_cli.transport.factors import Survival
 from reslrb_cli.transport.film import Film
 from reslrb_cli.transport.lamps import sums_of_areas
 from reslrb_cli.transport.pixel_shares import PixelShares
@@ -149,17 +148,16 @@ class Table:
     """Table for sampling.
 
     `slots` holds the cell of each slot, `weights` holds v / p of each cell, and `edges` holds the edges of the grid.
-    `survival` and `aim` hold data for roulette and aiming.
+    `aim` holds data for aiming.
     """
 
     slots: mi.UInt32
     weights: mi.Float
     edges: mi.Float
-    survival: Survival
     aim: Aim | None = None
 
     @staticmethod
-    def of(grid: Grid, counts: Array, survival: Survival | None = None, aim: Aim | None = None) -> Table:
+    def of(grid: Grid, counts: Array, aim: Aim | None = None) -> Table:
         """Return the table in which cell k has `counts[k]` slots. The total is `grid.slots`."""
         weights = grid.measures() * grid.slots  # 0 without a slot
         weights /= np.maximum(counts, 1)
@@ -167,7 +165,6 @@ class Table:
             own_memory(mi.UInt32, np.repeat(np.arange(grid.cells, dtype=np.uint32), counts)),
             own_memory(mi.Float, weights.astype(np.float32)),
             own_memory(mi.Float, np.array(grid.edges, np.float32)),
-            survival or Survival.certain(),
             aim,
         )
 

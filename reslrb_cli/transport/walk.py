@@ -96,9 +96,7 @@ class Hooks:
         return state
 
     def survived(self, state: Any, factor: mi.Float) -> Any:
-        """Return the state after roulette has multiplied the path's product by `factor`, 1/q. Without roulette, the
-        factor is 1.
-        """
+        """Return the state after roulette has multiplied the path's product by `factor`, 1/q."""
         return state
 
     def aimed(self, state: Any, factor: mi.Float) -> Any:
@@ -186,7 +184,6 @@ def walk(
     plan, scene, sensor = samples.plan, samples.scene, samples.sensor
     sampler = samples.sampler()
     selection = samples.stream(SELECTION_STREAM) if hooks.numbers else None
-    survival = None if samples.guide is None else samples.guide.table.survival
     aim = samples.guide.table.aim if samples.guide is not None and plan.aimed else None
 
     # ---- Leave the emitter ----
@@ -284,9 +281,9 @@ def walk(
 
         # ---- Russian roulette ----
         number = sampler.next_1d(active)
-        if plan.plays_roulette:
+        if plan.roulette:
             throughput = dr.max(dr.abs(hooks.colours.seen(product.magnitude())))
-            survives, factor = play(plan, survival, path.depth, throughput, eta, si.p, scattering.d, number)
+            survives, factor = play(plan, path.depth, throughput, eta, number)
             active &= survives
             product, state = product.scaled(factor), hooks.survived(state, factor)
 

@@ -1,6 +1,4 @@
-"""Ways of drawing paths that change no mean: guided emission, learned roulette, aimed scattering, and low-discrepancy
-numbers.
-"""
+"""Ways of drawing paths that change no mean: guided emission, aimed scattering, and low-discrepancy numbers."""
 
 from __future__ import annotations
 
@@ -13,12 +11,11 @@ import pytest
 from conformance import attached_cases, moving_lamps
 from conformance.gradient_cases import CASES
 
-from reslrb_cli.guiding.tables import Guiding, Learned, Purpose
+from reslrb_cli.guiding.tables import Learned, Purpose
 from reslrb_cli.integrators import context
 from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.transport.factors import CELLS, Survival
 from reslrb_cli.transport.samples import Table
 
 BY_NAME = {case.name: case for case in CASES}
@@ -81,27 +78,6 @@ def strength(ours: Any) -> float:
     return float((counts / (guiding.grid.slots * measures[measures > 0])).max())
 
 
-def harsh(scene: Case, ours: Any, factor: float = 1.0) -> Any:
-    """Let an integrator play roulette with a table of large contrasts that is unrelated to the scene. Return the
-    integrator.
-    """
-    ours.preparation.plan(scene.scene, scene.scene.sensors()[0], scene.params)
-    by_harsh_table(ours.preparation.guiding, factor)
-    return ours
-
-
-def by_harsh_table(guiding: Guiding, factor: float = 1.0) -> None:
-    """Give the guiding tables a roulette with large contrasts. Samples of the first sensor use it until the tables
-    learn again.
-    """
-    onward = guiding.learned[0].onward if 0 in guiding.learned else None
-    light = 1.0 if onward is None else onward.light
-    survival = Survival.of(guiding.box, factor / light * np.random.default_rng(1).lognormal(-1, 1.5, CELLS))
-    for purpose in Purpose:
-        table, counts = guiding._table(0, purpose)
-        guiding._tables[0, purpose] = replace(table, survival=survival), counts
-
-
 def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
     """Aim the samples of the first sensor by a random table of large contrasts."""
     tables = ours.preparation.guiding
@@ -110,12 +86,6 @@ def askew(scene: Case, ours: Any, factor: float = 1.5) -> None:
     learned = tables.learned.get(0) or Learned.nothing(tables.grid)
     tables.learned[0] = replace(learned, film=np.square([loud, loud], dtype=np.float32))
     tables._tables.clear()
-
-
-def with_roulette(name: str, steps: int = 1, **options: Any) -> tuple[Case, Any, Any]:
-    """Return the tracers of `guided`, of which the first plays the roulette of `harsh`."""
-    scene, ours, plain = guided(name, steps, **options)
-    return scene, harsh(scene, ours), plain
 
 
 def aimed(name: str, **options: Any) -> tuple[Case, Any, Any]:
@@ -180,9 +150,6 @@ WAYS = {
     "guided": Way(lambda name, **options: guided(name, 4, **options), (*EVERY, "gaussian", "area_texture", "rgba"),
                   (), "two_emitters", {"freeze": True},
                   lambda scene, ours, number: learn(scene, ours, number)),
-    "roulette": Way(with_roulette, (*EVERY, "mask_texture_in_view"), (), "two_emitters",
-                    {"freeze": True},
-                    lambda scene, ours, number: harsh(scene, ours, (1.0, 0.3, 3.0)[number]) and None),
     "aimed": Way(aimed, (*EVERY, *GLOSSY), ("crop",), "roughplastic", {"freeze": True},
                  _changed_aim),
     "aimed_sequence": Way(lambda name, **options: aimed(name, **LOW_DISCREPANCY, **options), ("roughplastic",),

@@ -52,8 +52,8 @@ def of_the_neighbour(patch: pytest.MonkeyPatch) -> None:
 def _weigh(patch: pytest.MonkeyPatch, change: Any) -> None:
     right = drawing.Table.of
 
-    def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
-        table = right(grid, counts, *survival)
+    def wrong(grid: Any, counts: np.ndarray, *aim: Any) -> Any:
+        table = right(grid, counts, *aim)
         weights = change(grid, counts, np.array(table.weights, np.float64))
         return replace(table, weights=mi.Float(weights.astype(np.float32)))
 
@@ -70,8 +70,8 @@ def of_another_emitter(patch: pytest.MonkeyPatch) -> None:
     """The number that selects the emitter lies in an interval for emitters with other shares."""
     right = drawing.Table.of
 
-    def wrong(grid: Any, counts: np.ndarray, *survival: Any) -> Any:
-        table = right(grid, counts, *survival)
+    def wrong(grid: Any, counts: np.ndarray, *aim: Any) -> Any:
+        table = right(grid, counts, *aim)
         return replace(table, edges=mi.Float(np.sqrt(np.array(table.edges))))
 
     patch.setattr(drawing.Table, "of", staticmethod(wrong))

@@ -28,7 +28,6 @@ from conformance.drawing import (
     sample,
     samples,
     strength,
-    with_roulette,
 )
 from conformance.guiding_faults import FAULTS as GUIDING_FAULTS
 from conformance.operations import nothing_is_compiled_without
@@ -40,7 +39,6 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.transport import aim, walk
 from reslrb_cli.transport.aim import Aim, Blocks, Pending
-from reslrb_cli.transport.factors import Product
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -106,7 +104,7 @@ def test_means_over_many_seeds_agree(name: str, guiding: str) -> None:
 
 
 #: The kinds of steps that the default suite runs.
-STEPS = {"roulette-reservoir-correlated"}
+STEPS = {"aimed-reservoir-correlated"}
 
 
 @pytest.mark.parametrize(
@@ -130,17 +128,6 @@ def test_every_kind_of_step_has_the_plain_mean(way: str, estimator: str, adjoint
 
 
 # Faults that bias the result.
-
-
-def without_weight(patch: pytest.MonkeyPatch) -> None:
-    """Do not raise the weight of paths that survive roulette."""
-    patch.setattr(Product, "scaled", lambda self, scale: self)
-
-
-def of_another_cell(patch: pytest.MonkeyPatch) -> None:
-    """Compute the weight of surviving paths from a probability that differs from the survival probability."""
-    right = dr.rcp
-    patch.setattr(walk.dr, "rcp", lambda q: right(dr.clip(1.1 * q, 0, 1)))
 
 
 def without_factor(patch: pytest.MonkeyPatch) -> None:
@@ -199,8 +186,6 @@ def _with_share(found: Any) -> Any:
 
 #: Each fault: its way, a case that shows it, the number of seeds, and whether the default suite plants it.
 FAULTS: list[tuple[Callable[[pytest.MonkeyPatch], None], str, str, int, bool]] = [
-    (without_weight, "roulette", "two_emitters", 32, True),
-    (of_another_cell, "roulette", "two_emitters", 32, True),
     (without_factor, "aimed", "roughplastic", 48, True),
     (of_even_density, "aimed", "roughplastic", 48, True),
     (behind_others, "aimed", "mesh_attribute", 96, False),
@@ -244,9 +229,6 @@ def worst_of_replays(make: Callable[..., tuple[Case, Any, Any]], name: str, **op
 
 #: For each way: the function that makes its tracers, its cases, the cases of the default suite, and a fault of replays.
 REPLAYS: dict[str, tuple[Any, tuple[str, ...], tuple[str, ...], Callable[[pytest.MonkeyPatch], None]]] = {
-    "roulette": (with_roulette, ("two_emitters", "mask_texture_in_view"), ("two_emitters",),
-                 lambda patch: replayed_from(patch, lambda table: replace(table, survival=replace(
-                     table.survival, chances=1.2 * table.survival.chances)))),
     "aimed": (aimed, ("roughplastic", "plastic", "mask_texture_in_view"), ("plastic",),
               lambda patch: replayed_from(patch, lambda table: replace(table, aim=replace(
                   table.aim, slots=0 * table.aim.slots)))),

@@ -40,7 +40,7 @@ QUICK: dict[str, Callable[..., None]] = {
 #: Files whose default tests do not assume that a path's values are the channels of the film.
 FILES = ["aim", "attached", "attached_camera", "attached_reservoir", "camera_paths", "drawing", "edges", "freezing",
          "gradients", "guiding", "guiding_tables", "image_paths", "image_plugins", "kernels", "memory",
-         "moving_emitters", "plan", "plugin", "replay", "sequences", "shuffled", "small_lamps", "survival",
+         "moving_emitters", "plan", "plugin", "replay", "sequences", "shuffled", "small_lamps",
          "weights"]  # fmt: skip
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from agreement import compare, renders
 from conformance.gradient_cases import CASES, IN_EXPECTATION
+from conformance.guiding_faults import without_weight
 from measure.faults import checked, estimators_of
 from measure.faults import room as room_moving
 from turns import a_few
@@ -21,7 +22,6 @@ from turns import a_few
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import reservoir, stack
-from reslrb_cli.guiding import tables
 from reslrb_cli.integrators import forward
 from reslrb_cli.measure.draws import DrawsFile
 from reslrb_cli.measure.gradcheck import Gradcheck
@@ -53,7 +53,6 @@ from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Ve
 from reslrb_cli.report.tables import summary_lines
 from reslrb_cli.scene.visibility import interior
 from reslrb_cli.transport import walk as segment
-from reslrb_cli.transport.factors import CELLS, Survival
 
 # Gradcheck on a small Cornell box: the current code passes, and planted faults are found and named.
 
@@ -105,13 +104,7 @@ def test_differently_sampled_paths_agree_with_naive_ad_in_expectation(drawn: str
 
 @pytest.mark.parametrize("guiding", a_few(["on", "auto"], ["auto"]))
 def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch: pytest.MonkeyPatch):
-    """Runs with guiding, or with `auto`, are compared with unguided steps. The comparison also covers a table by which
-    half of all paths end at each vertex.
-    """
-    from reslrb_cli.transport import walk
-
-    of, play = Survival.of, walk.play
-    monkeypatch.setattr(tables.Survival, "of", staticmethod(lambda box, chances: of(box, np.zeros(CELLS))))
+    """Runs with guiding, or with `auto`, are compared with unguided steps, which lack a fault of the tables."""
     guided = (f"integrator.guiding={guiding}", *SMALLER)
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *guided])
     made = Gradcheck(CheckSettings(config, estimators_of("stack"), 0, 8))
@@ -119,11 +112,7 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
     [record] = made.run(lambda: False, lambda line: None)
     assert (record.seeds, record.holds) == (8, True)
 
-    def without_weight(plan: Any, survival: Any, *rest: Any) -> Any:
-        survives, weight = play(plan, survival, *rest)
-        return survives, weight if survival is None else mi.Float(1)
-
-    monkeypatch.setattr(walk, "play", without_weight)
+    without_weight(monkeypatch)
     found = failures(check(*guided, estimators="stack"))
     assert ("stack", "unguided") in found
     assert guiding == "on" or found == {("stack", "unguided")}

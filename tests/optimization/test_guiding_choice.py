@@ -234,7 +234,7 @@ def test_a_run_reports_remembers_and_records_the_decision(
     row = next(line for line in inspected(capsys, str(RUN)) if part in line)
     assert row.split()[0] == "needed"
     # At most as many cells as the 16,384 paths of a batch can distinguish.
-    assert "65536 cells, 6.1 MiB" in row
+    assert "65536 cells, 5.2 MiB" in row
     assert f"guiding: auto, {gain}" in row
     row = next(line for line in inspected(capsys, "tiny.yaml", "--set", AUTO[0]) if part in line)
     assert row.startswith("  left out")
