@@ -13,7 +13,6 @@ import gc
 import logging
 import os
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.estimators.base import Estimator
+    from reslrb_cli.measure.draws import Draws
 
 Array: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 #: Description of an experiment: a configuration file, a run folder, a mapping with the content of YAML, or a `Config`.
@@ -424,6 +424,14 @@ def check_estimator(
         return found
 
 
+class ConvergenceLines(list[Line]):
+    """Records of `convergence`. `draws` has the draws of each method by its label. References have names such as
+    `reference reslrb:stack`.
+    """
+
+    draws: Mapping[str, Draws]
+
+
 def convergence(
     experiment: Experiment,
     integrators: str | None = None,
@@ -432,17 +440,20 @@ def convergence(
     rounds: int | None = None,
     spps: Sequence[int] = (),
     reference: str | None = None,
+    draws: str | os.PathLike[str] | None = None,
     allow_code: bool = False,
-) -> list[Line]:
+) -> ConvergenceLines:
     """Measure how fast the error of each method falls, as `reslrb convergence` does (docs/convergence.md).
 
-    Returns the records that `--json` writes: points, methods, references and a summary sentence. The arguments are the
-    options of the command.
+    Returns a list of the records that `--json` writes: points, methods, references and a summary sentence. Its
+    attribute `draws` maps the label of each method to its samples as arrays (`Draws`). The arguments are the options of
+    the command.
 
     - `integrators`, `reference`: as for `--integrators` and `--reference`.
     - `budget`: total time in seconds.
     - `rounds`: number of rounds, regardless of `budget`.
     - `spps`: sample counts per pixel to compare.
+    - `draws`: file that keeps all draws. Draws that it has are not drawn again.
     - `allow_code`: permit running the files of your own integrators.
 
     Each method runs in its own process with the experiment's variant. The calling process sets no variant. An interrupt
@@ -452,6 +463,7 @@ def convergence(
     with called() as stop:
         config = _for_processes(experiment, allow_code)
         from reslrb_cli.measure.convergence import Session
+        from reslrb_cli.measure.draws import DrawsFile
         from reslrb_cli.measure.judgement import Judgement
         from reslrb_cli.measure.methods import ConvergencePlan
         from reslrb_cli.report.tables import result_lines
@@ -460,14 +472,15 @@ def convergence(
         plan = ConvergencePlan.of(
             config, objective, integrators, reference, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps))
         )
-        with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
-            spent_s = time.monotonic() - began
-            session = Session(plan, Path(name), stop, logger.info, spent_s=spent_s)
-            for _ in session.run():
-                pass
-            if stop():
-                raise KeyboardInterrupt
-            return result_lines(Judgement(session).results())
+        file = DrawsFile(None if draws is None else as_path(draws, "draws", "a file"))
+        session = Session(plan, stop, logger.info, spent_s=time.monotonic() - began, file=file)
+        for _ in session.run():
+            pass
+        if stop():
+            raise KeyboardInterrupt
+        found = ConvergenceLines(result_lines(Judgement(session).results()))
+        found.draws = {member.name: member.draws for member in session.members}
+        return found
 
 
 def bench(
@@ -503,13 +516,12 @@ def bench(
             raise ConfigError("sweep", "", f"is {sweep!r}; there are {', '.join(get_args(Swept))}")
         _check_counts(rounds=[rounds], values=values)
         plan = Sweep.of(config, sweep, tuple(values), integrators, DEEPEST, budget_s=budget, rounds=rounds)
-        with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
-            session = Bench(plan, Path(name), stop, logger.info, spent_s=time.monotonic() - began)
-            for _ in session.run():
-                pass
-            if stop():
-                raise KeyboardInterrupt
-            return [result.record for result in session.results()]
+        session = Bench(plan, stop, logger.info, spent_s=time.monotonic() - began)
+        for _ in session.run():
+            pass
+        if stop():
+            raise KeyboardInterrupt
+        return [result.record for result in session.results()]
 
 
 def _for_processes(experiment: Experiment, allow_code: bool) -> Config:

@@ -15,6 +15,7 @@ from reslrb_cli.cli.options import (
     Keeper,
     check_writable,
     comparison_options,
+    draws_option,
     exit_code,
     experiment_arguments,
     measuring,
@@ -37,6 +38,7 @@ class ConvergenceOptions(ComparisonOptions):
     objective: str
     spps: tuple[int, ...] | None
     reference: str | None
+    draws: Path | None
 
 
 @click.command("convergence")
@@ -58,6 +60,7 @@ class ConvergenceOptions(ComparisonOptions):
               help=
         "Method whose mean over many steps is the reference for errors. Default: reslrb:stack with half light "
         "paths and half camera paths, if CONFIG allows it.")  # fmt: skip
+@draws_option
 @comparison_options
 def command(**given: Any) -> int:
     """Measure how fast each method's error falls for CONFIG. The parameters have initial values, and the first sensor
@@ -78,18 +81,21 @@ def command(**given: Any) -> int:
     if objective == "loss":
         check_code(config)
     check_writable("--json", json_file)
+    check_writable("--draws", options.draws)
     plan = ConvergencePlan.of(
         config, objective, options.integrators, options.reference, budget_s=options.budget, rounds=options.rounds,
         spps=options.spps or (),
     )  # fmt: skip
-    results, interrupted = _run(plan, json_file, began)
+    results, interrupted = _run(plan, options, began)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
-def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[ConvergenceResults, bool]:
+def _run(plan: ConvergencePlan, options: ConvergenceOptions, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
-    from reslrb_cli.measure.convergence import Role, Session
+    from reslrb_cli.measure.convergence import Session
+    from reslrb_cli.measure.draws import DrawsFile
+    from reslrb_cli.measure.engine import Role
     from reslrb_cli.measure.judgement import Judgement
     from reslrb_cli.report.tables import (
         closing_sentence,
@@ -99,8 +105,8 @@ def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[C
         result_lines,
     )
 
-    with measuring(Session, plan, began) as (session, interrupts):
-        keeper = Keeper(json_file, origin_of(plan.variant), lambda: result_lines(Judgement(session).results()))
+    with measuring(Session, plan, began, file=DrawsFile(options.draws)) as (session, interrupts):
+        keeper = Keeper(options.json_file, origin_of(plan.variant), lambda: result_lines(Judgement(session).results()))
         table: Columns | None = None
         for rounds in session.run():
             keeper.refresh()
@@ -120,7 +126,8 @@ def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[C
         echo(table.head())
         for record in results.methods:
             echo(table.line(method_cells(record)))
-        for line in [*map(reference_line, results.references), *notes(results.methods)]:
+        remarks = [results.remark] if results.remark else []
+        for line in [*map(reference_line, results.references), *notes(results.methods), *remarks]:
             echo(line)
         echo(closing_sentence(results.methods, results.references))
         return results, interrupts.requested
@@ -128,10 +135,10 @@ def _run(plan: ConvergencePlan, json_file: Path | None, began: float) -> tuple[C
 
 def _table(session: Session) -> Columns:
     """Return a table with columns that fit the finished and the expected results of the session."""
-    from reslrb_cli.measure.convergence import Role
+    from reslrb_cli.measure.engine import Role
     from reslrb_cli.report.tables import method_columns
 
-    labels = [member.label for member in session.of(Role.CASE)]
+    labels = [member.request.label for member in session.of(Role.CASE)]
     return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])
 
 

@@ -23,12 +23,12 @@ from typing import IO
 
 import click
 
-from reslrb_cli.backend.doctor import ask_gpu, free_bytes, of_system
+from reslrb_cli.backend.doctor import ask_gpu, free_bytes
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.config.files import tail
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.processes import last_words
+from reslrb_cli.measure.processes import last_words, memory_of
 from reslrb_cli.report.format import shorten
 
 #: Maximum wait, in seconds, for the end of runs that must end at once.
@@ -196,7 +196,7 @@ def call(arguments: Sequence[str], interrupts: Interrupts, slot: RunSlot, fresh:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     code = process.wait(_POLL_SECONDS)
                 slot.line = next(filter(_PROGRESS.match, reversed(_last_lines(output))), "")
-                slot.resident, slot.peak = (_memory(process.pid, name) for name in ("VmRSS", "VmHWM"))
+                slot.resident, slot.peak = (memory_of(process.pid, name) for name in ("VmRSS", "VmHWM"))
                 slot.show()
         finally:
             slot.process, slot.line = None, ""
@@ -211,12 +211,6 @@ def call(arguments: Sequence[str], interrupts: Interrupts, slot: RunSlot, fresh:
         memory = " (often sent when memory runs out)" if -code == signal.SIGKILL else ""
         return (ExitCode.INTERRUPTED if told else code), f"ended by {name}{memory}: {last_words(chr(10).join(said))}"
     return code, said[-1] if said else f"ended with exit code {code}, without a message"
-
-
-def _memory(process: int, kind: str) -> int:
-    """Return the memory of a process in bytes: `VmRSS` now, or `VmHWM` at most. Return 0 if it is unknown."""
-    found = of_system(f"/proc/{process}/status", kind)
-    return int(found.removesuffix(" kB")) * 1024 if found else 0
 
 
 def _last_lines(output: IO[bytes]) -> list[str]:

@@ -10,8 +10,6 @@ import contextlib
 import errno
 import functools
 import os
-import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -30,7 +28,7 @@ from reslrb_cli.records.measurement_files import Line, LivePage, Origin, is_stre
 from reslrb_cli.records.measurements import BenchStatus
 
 if TYPE_CHECKING:
-    from reslrb_cli.measure.arena import Arena
+    from reslrb_cli.measure.engine import Engine
     from reslrb_cli.measure.methods import Measurement
 
 
@@ -79,32 +77,25 @@ class Keeper:
             write_lines(file, [self._origin, *self._lines()])
 
 
-A = TypeVar("A", bound="Arena[Any, Any, Any]")
+E = TypeVar("E", bound="Engine")
 
 
 @contextmanager
 def measuring(
-    kind: type[A], plan: Measurement, began: float, say: Callable[[str], None] = echo, **options: Any
-) -> Iterator[tuple[A, Interrupts]]:
-    """Yield a session that measures `plan`, and the session's `Interrupts`. Removes the session's folder and workers at
-    the end.
+    kind: Callable[..., E], plan: Measurement, began: float, say: Callable[[str], None] = echo, **options: Any
+) -> Iterator[tuple[E, Interrupts]]:
+    """Yield a session that measures `plan`, and the session's `Interrupts`. The session's processes end with it.
 
     `began` is the `monotonic` time at which the command was called. `options` are further arguments of `kind`. Raises
     ConfigError.
     """
     from reslrb_cli.measure.processes import abandon_all
 
-    with tempfile.TemporaryDirectory(prefix="reslrb-measuring-") as name:
-
-        def tidy() -> None:
-            abandon_all()
-            shutil.rmtree(name, ignore_errors=True)
-
-        with Interrupts(last_act=tidy) as interrupts:
-            spent_s = time.monotonic() - began
-            session = kind(plan, Path(name), lambda: interrupts.requested, say, spent_s=spent_s, **options)
-            echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, 'round')}")
-            yield session, interrupts
+    with Interrupts(last_act=abandon_all) as interrupts:
+        spent_s = time.monotonic() - began
+        session = kind(plan, lambda: interrupts.requested, say, spent_s=spent_s, **options)
+        echo(f"{plan.device}, {plan.variant}; {allowance(plan.budget_s, plan.rounds, 'round')}")
+        yield session, interrupts
 
 
 def exit_code(interrupted: bool, done: bool, states: set[BenchStatus]) -> ExitCode:

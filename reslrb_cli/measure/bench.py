@@ -1,9 +1,8 @@
 """Time and memory of a step against path depth or the number of samples, for several integrators side by side.
 
-`sweep` selects the quantity. At each value, every case (`BenchRun`) has its own process, and all processes exist at
-once (`Bench`). Each process takes a cold step. Further steps follow until no new kernel is compiled. Then rounds
-follow. In each round, every process takes one step, and the order of the processes changes from round to round. The
-steps of a round share a seed. Ratios compare steps of the same round.
+At each value of the swept quantity, every case has its own process, and all processes exist at once. The cases take
+turns (`Engine`): in each round, every process takes one timed step, and the steps of a round share a seed. Ratios
+compare steps of the same round.
 
 A case that runs out of memory is tried again at greater depths, so every record is an observation. A measurement begins
 anew each time, because times of two days are not comparable. A case of the default list that does not support the scene
@@ -13,21 +12,22 @@ compile are left out, and the output names these cases. Each case that has compi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from reslrb_cli.config.schema import Config
-from reslrb_cli.measure.arena import MAX_ROUNDS, NO_TIME, Arena, Contestant
+import numpy as np
+
+from reslrb_cli.measure.engine import NO_TIME, Engine, Member, Request
 from reslrb_cli.measure.methods import NamedIntegrator, Sweep, paths_in_records
 from reslrb_cli.measure.processes import Stopped
-from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
+from reslrb_cli.records.measurements import BenchRecord, Spread
+
+#: Maximum number of rounds.
+MAX_ROUNDS = 25
 
 #: Sizes that all cases have in common; None until a case has loaded its scene.
 SIZES = ("width", "height", "texels")
-
-#: Measured quantities of every step.
-TIMES = ("step_ms", "kernel_ms", "codegen_ms", "tracing_ms")
 
 
 @dataclass(frozen=True)
@@ -46,79 +46,55 @@ class BenchResult:
     reason: str
 
 
-@dataclass(kw_only=True)
-class BenchRun(Contestant):
-    """One case at one value. `steps` has its steps by round."""
-
-    case: NamedIntegrator
-    config: Config
-    steps: dict[int, dict[str, Any]] = field(default_factory=dict)
-
-    @property
-    def done(self) -> bool:
-        """Whether it has any result."""
-        return self.end is not None or bool(self.steps)
-
-    def question(self, round: int | None) -> dict[str, Any]:
-        """Return the request for one step with the seed of the round."""
-        return {"round": 0 if round is None else round + 1}
-
-    def keep(self, round: int, answer: dict[str, Any]) -> None:
-        """Record a step."""
-        self.steps[round] = answer
-
-
-def _result(run: BenchRun, value: int, baseline: BenchRun, size: Mapping[str, int | None]) -> BenchResult:
-    options, figures = run.config.integrator.options(), dict[str, Any](size)
-    if run.end is None:
-        figures |= {name: Spread.of([step[name] for step in run.steps.values()]) for name in TIMES}
-        figures["repeats"] = len(run.steps)
-        if run.cold:
-            figures |= {"cold_ms": run.cold["step_ms"]}
-            figures |= {name: run.cold[name] for name in ("peak_mib", "scratch_bytes")}
+def bench_result(member: Member, value: int, baseline: Member, size: Mapping[str, int | None]) -> BenchResult:
+    """Return the result of a member's draws, relative to the draws of the baseline."""
+    config, case, draws, figures = member.request.config, member.request.case, member.draws, dict[str, Any](size)
+    options = config.integrator.options()
+    if member.failure is None:
+        tracing_ms = np.maximum(draws.step_ms - draws.kernel_ms - draws.codegen_ms, 0.0)
+        times = {"step_ms": draws.step_ms, "kernel_ms": draws.kernel_ms, "codegen_ms": draws.codegen_ms}
+        figures |= {name: Spread.of(time.tolist()) for name, time in (times | {"tracing_ms": tracing_ms}).items()}
+        figures |= {name: getattr(draws, name) for name in ("cold_ms", "peak_mib", "scratch_bytes")}
+        figures["repeats"] = len(draws)
     record = BenchRecord(
-        integrator=run.case.type,
-        estimator=run.case.estimator,
+        integrator=case.type,
+        estimator=case.estimator,
         capacity=options.get("capacity"),
-        max_depth=run.config.integrator.max_depth,
+        max_depth=config.integrator.max_depth,
         rr_depth=options["rr_depth"],
-        spp=run.config.run.spp,
-        status=BenchStatus.OK if run.end is None else run.end.status,
-        **paths_in_records(run.config),
-        label=run.case.label,
-        options=run.case.options,
+        spp=config.run.spp,
+        status=member.status,
+        **paths_in_records(config),
+        label=case.label,
+        options=case.options,
         **figures,
     )
-    kernel, step = (_ratio(run, baseline, key) for key in ("kernel_ms", "step_ms"))
-    return BenchResult(run.case, value, record, kernel, step, "" if run.end is None else run.end.reason)
+    kernel, step = (_ratio(member, baseline, name) for name in ("kernel_ms", "step_ms"))
+    return BenchResult(case, value, record, kernel, step, "" if member.failure is None else member.failure.reason)
 
 
-def _ratio(run: BenchRun, baseline: BenchRun, key: str) -> Spread | None:
-    """Return ratios of the common rounds. Returns None if the runs have no common rounds, or if one of the runs has
-    ended.
-    """
-    both = [(step[key], baseline.steps[round][key]) for round, step in run.steps.items() if round in baseline.steps]
-    ratios = [own / its for own, its in both if its and run.end is None and baseline.end is None]
-    return Spread.of(ratios) if ratios else None
+def _ratio(member: Member, baseline: Member, name: str) -> Spread | None:
+    """Return ratios of the common rounds. Returns None if the members have no common rounds, or if one has failed."""
+    if member.failure is not None or baseline.failure is not None:
+        return None
+    _, own, its = np.intersect1d(member.draws.seeds, baseline.draws.seeds, return_indices=True)
+    own_ms, its_ms = getattr(member.draws, name)[own], getattr(baseline.draws, name)[its]
+    ratios = own_ms[its_ms > 0] / its_ms[its_ms > 0]
+    return Spread.of(ratios.tolist()) if len(ratios) else None
 
 
-#: The function that a process runs.
-STEPS = "reslrb_cli.measure.steps:begin_steps"
+class Bench(Engine):
+    """Measurement for each value of the sweep.
 
-
-class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
-    """Measurement for each value of the sweep (see `Arena`). No process writes into its folder.
-
-    `runs` has the runs by value, and `left_out` the cases that do not support the scene. `size` has the `width` and
+    `runs` has the members by value, and `left_out` the cases that do not support the scene. `size` has the `width` and
     `height` of the film in pixels, and the `texels` of all textures that are parameters.
     """
 
-    MOST_ROUNDS = MAX_ROUNDS
-
-    def _set_up(self) -> int:
-        self.runs, self.left_out = dict[int, list[BenchRun]](), list[NamedIntegrator]()
+    def __init__(self, plan: Sweep, stop: Callable[[], bool], say: Callable[[str], None], **given: Any) -> None:
+        super().__init__(plan, stop, say, depths=len(plan.values), most=MAX_ROUNDS, **given)
+        self.plan = plan
+        self.runs, self.left_out = dict[int, list[Member]](), list[NamedIntegrator]()
         self.size: dict[str, int | None] = dict.fromkeys(SIZES)
-        return len(self.plan.values)
 
     def results(self) -> list[BenchResult]:
         """Return the results so far, in the order of the sweep."""
@@ -126,56 +102,45 @@ class Bench(Arena[Sweep, BenchRun, list[BenchResult]]):
 
     def _results(self, value: int) -> list[BenchResult]:
         runs = self.runs[value]
-        baseline = next(run for run in runs if run.case == self.plan.baseline)
-        return [_result(run, value, baseline, self.size) for run in runs if run.done]
+        baseline = next(run for run in runs if run.request.case == self.plan.baseline)
+        done = [run for run in runs if run.failure is not None or run.kept]
+        return [bench_result(run, value, baseline, self.size) for run in done]
 
-    def _course(self) -> Iterator[list[BenchResult]]:
+    def measure(self) -> Iterator[list[BenchResult]]:
         """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
         missing measurements.
         """
-        plan, values = self.plan, self.plan.values
+        plan, values, stopped = self.plan, self.plan.values, False
         for number, value in enumerate(values):
-            if self._pace.over():
-                self._say(f"not measured: {plan.name(*values[number:])}: {NO_TIME}")
+            if self.pace.over():
+                self.say(f"not measured: {plan.name(*values[number:])}: {NO_TIME}")
                 return
-            self._pace.begin_depth()
-            stopped = False
+            self.pace.begin_depth()
+            self.members = self.runs[value] = [
+                Member(request=self._request(case, value), file=self.file)
+                for case in plan.cases if case not in self.left_out
+            ]  # fmt: skip
             try:
-                self._begin(value)
-                for _ in self._measure():
+                for _ in self.begin(self.members, {}):
+                    self.size |= next((run.opening for run in self.members if run.opening), {})
+                for _ in self.take_rounds():
                     yield []
             except Stopped:
                 stopped = True
-            late = [run for run in self.members if run.late and not run.steps]
             for run in self.members:
                 run.close()
                 if run.refusal is not None:
-                    self._say_end(run, run.case.label)
-                    self.left_out.append(run.case)
-            if late:
-                names = ", ".join(run.case.label for run in late)
-                self._say(f"not measured: {plan.name(value)}, {names}: {NO_TIME}")
+                    self.say(f"left out: {run.request.label}: {run.refusal}")
+                    self.left_out.append(run.request.case)
+            if late := [run.request.label for run in self.members if run.late and not run.kept]:
+                self.say(f"not measured: {plan.name(value)}, {', '.join(late)}: {NO_TIME}")
             yield self._results(value)
             if stopped:
                 return
 
-    def _begin(self, value: int) -> None:
-        """Start the cases at one value."""
-        plan, self.members = self.plan, []
-        self.runs[value] = self.members
-        for case in plan.cases:
-            if case not in self.left_out:
-                config = plan.at(case, value)
-                process = self._start(plan.first(config), STEPS)
-                self.members.append(
-                    BenchRun(process=process, may_refuse=plan.may_refuse(case), case=case, config=config)
-                )
-
-    def _measure(self) -> Iterator[int]:
-        for run in self._alive():
-            answer = self._open(run)
-            if answer is not None:
-                self.size = {name: answer[name] for name in SIZES}
-        for run in self._alive():
-            self._warm_up(run)
-        return self._take_rounds()
+    def _request(self, case: NamedIntegrator, value: int) -> Request:
+        config = self.plan.at(case, value)
+        return Request(
+            case=case, config=config, label=case.label, quantity="step", spp=config.run.spp, purpose="image",
+            about={"label": case.label, "value": value}, repeats=True, may_refuse=self.plan.may_refuse(case),
+        )  # fmt: skip

@@ -36,6 +36,9 @@ FORMAT = 1
 #: Arrays of draws, with one row for each draw.
 ARRAYS = ("values", "seeds", "step_ms", "kernel_ms", "codegen_ms", "origin")
 
+#: Figures of the first step of a process.
+FIRST_STEP = ("peak_mib", "cold_ms", "scratch_bytes")
+
 #: Packages whose versions determine a draw.
 PACKAGES = ("reslrb", "mitsuba", "drjit")
 
@@ -83,7 +86,9 @@ class Draws:
         """
         count, session = len(seeds), this_session() if origin is None else origin
         times = {"step_ms": step_ms, "kernel_ms": kernel_ms, "codegen_ms": codegen_ms}
-        filled = {name: np.broadcast_to(np.asarray(time, np.float64), count) for name, time in times.items()}
+        filled: dict[str, Any] = {
+            name: np.broadcast_to(np.asarray(time, np.float64), count) for name, time in times.items()
+        }
         rows = np.asarray(values, np.float32).reshape(count, -1) if count else np.zeros((0, 0), np.float32)
         return cls(label=label, values=rows, seeds=np.array(seeds, np.int64).reshape(-1), **filled,
                    origin=np.full(count, session), **others)  # fmt: skip
@@ -106,14 +111,11 @@ class Draws:
         the first part counts. Figures of the first step are from the first part that has them.
         """
         filled = [part for part in parts if len(part)] or [parts[0]]
-        whole = replace(parts[0], **{
-            name: next((value for part in parts if (value := getattr(part, name)) is not None), None)
-            for name in ("peak_mib", "cold_ms", "scratch_bytes")
-        })  # fmt: skip
-        if len(filled) > 1:
-            whole = replace(whole, **{name: np.concatenate([getattr(p, name) for p in filled]) for name in ARRAYS})
-        elif filled[0] is not parts[0]:
-            whole = replace(whole, **{name: getattr(filled[0], name) for name in ARRAYS})
+        fields: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in filled]) for name in ARRAYS}
+        for name in FIRST_STEP:
+            known = (value for part in parts if (value := getattr(part, name)) is not None)
+            fields[name] = next(known, None)
+        whole = replace(parts[0], **fields)
         return whole.where(np.unique(whole.seeds, return_index=True)[1])
 
 
@@ -207,14 +209,14 @@ class DrawsFile:
         self._stored[key_of(dict(about))] = stored
         self._changed = True
 
-    def differences(self, about: Mapping[str, Any], label: str) -> list[str]:
-        """Return the parts of a situation that differ from the most similar draws of the same label. The list is empty
-        if there are draws of this situation, or none of the label.
+    def differences(self, about: Mapping[str, Any]) -> list[str]:
+        """Return the parts of a situation that differ from the most similar draws of the same `purpose`. The list is
+        empty if there are draws of this situation, or none of the purpose.
         """
         found = [
             [name for name in about if other.get(name) != about[name]]
-            for key, other in self._about.items()
-            if self._parts[key][0].label == label
+            for other in self._about.values()
+            if other.get("purpose") == about.get("purpose")
         ]
         return min(found, key=len, default=[])
 
@@ -232,10 +234,8 @@ class DrawsFile:
         entries, arrays = [], dict[str, Array]()
         for number, (key, one) in enumerate(kept.items()):
             arrays |= {f"{number}/{name}": getattr(one, name) for name in ARRAYS}
-            entries.append({
-                "about": self._about[key], "label": one.label, "options": dict(one.options),
-                "peak_mib": one.peak_mib, "cold_ms": one.cold_ms, "scratch_bytes": one.scratch_bytes,
-            })  # fmt: skip
+            first = {name: getattr(one, name) for name in FIRST_STEP}
+            entries.append({"about": self._about[key], "label": one.label, "options": dict(one.options), **first})
         for number, one_stored in enumerate(self._stored.values()):
             arrays |= {f"stored {number}/{name}": array for name, array in one_stored.arrays.items()}
         header = {
@@ -263,7 +263,8 @@ class DrawsFile:
                 raise ConfigError(self.path, "", reason)
             arrays = dict(archive)
             for number, entry in enumerate(header["draws"]):
-                about, own = entry.pop("about"), {name: arrays[f"{number}/{name}"] for name in ARRAYS}
+                about = entry.pop("about")
+                own: dict[str, Any] = {name: arrays[f"{number}/{name}"] for name in ARRAYS}
                 if {len(array) for array in own.values()} != {len(own["seeds"])} or own["values"].ndim != 2:
                     raise ValueError(f"entry {number} has arrays of different lengths")
                 key = key_of(about)

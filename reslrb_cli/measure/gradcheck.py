@@ -23,7 +23,6 @@ import numpy as np
 from reslrb_cli.config.integrators import PLAIN
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
-from reslrb_cli.measure.arena import NO_TIME
 from reslrb_cli.measure.comparison import (
     ROUNDING,
     STOCK_ROUNDING,
@@ -34,6 +33,7 @@ from reslrb_cli.measure.comparison import (
     entry_count,
 )
 from reslrb_cli.measure.draws import Draws, DrawsFile, Stored
+from reslrb_cli.measure.engine import NO_TIME
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -31,11 +32,11 @@ from reslrb_cli.measure.comparison import (
     entry_count,
     tail_weight,
 )
-from reslrb_cli.measure.convergence import FEWEST, Member, Role, Session
+from reslrb_cli.measure.convergence import FEWEST, Session
+from reslrb_cli.measure.engine import Member, Role
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     TARGETS,
-    BenchStatus,
     Method,
     MethodRecord,
     PointRecord,
@@ -259,11 +260,12 @@ def _joined(value: float, left: np.ndarray, right: np.ndarray) -> JackknifeEstim
 
 @dataclass(frozen=True)
 class ConvergenceResults:
-    """All records of a session."""
+    """All records of a session. `remark` is a warning about compared times, or empty."""
 
     points: list[PointRecord]
     methods: list[MethodRecord]
     references: list[ReferenceRecord]
+    remark: str = ""
 
 
 @dataclass(frozen=True)
@@ -288,15 +290,15 @@ class Judgement:
         #: Each parameter's slice, and the slice of all parameters together if there are several.
         self._places = self._slices if len(self._slices) == 1 else self._slices | {ALL: slice(None)}
         for found in session.of(Role.REFERENCE):
-            if len(set(found.turns)) >= FEWEST and not found.message:
+            if len(found.kept) >= FEWEST and not _flaw(found):
                 self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places.items()}
 
     def _rows(self, member: Member, place: slice) -> np.ndarray:
         """Return the independent estimates that a reference member has made, (K, P): the means of its turns. If there
         are several dL/dI, turns with the same dL/dI are combined.
         """
-        turns, rows = np.array(member.turns), np.stack(member.rows)[:, place].astype(np.float64)
-        if self._session.plan.objective == "loss" and len(set(member.turns)) > IMAGES:
+        turns, rows = member.turns, member.draws.values[:, place].astype(np.float64)
+        if self._session.plan.objective == "loss" and len(member.kept) > IMAGES:
             turns = turns % IMAGES
         return np.stack([rows[turns == turn].mean(0) for turn in np.unique(turns)])
 
@@ -316,21 +318,21 @@ class Judgement:
         cases, references = session.of(Role.CASE), session.of(Role.REFERENCE)
         points: list[PointRecord] = []
         methods: list[MethodRecord] = []
-        judged = {member.label: self._biases(member) for member in cases if self._measured(member)}
+        judged = {member.request.label: self._biases(member) for member in cases if self._measured(member)}
         own = self._biases(references[0]) if self.ready else {}
         for member in cases:
             if member.refusal is not None:
                 continue
             for key in self._places:
-                methods.append(self._method(member, key, judged.get(member.label, {}).get(key, _Bias()), own))
+                methods.append(self._method(member, key, judged.get(member.request.label, {}).get(key, _Bias()), own))
                 if self._has_figures(member, key):
-                    points += self._samples(member, key).points(member.method, key)
+                    points += self._samples(member, key).points(_method(member), key)
         stood = [self._stood(references[0], key, own[key]) for key in self._places] if self.ready else []
-        return ConvergenceResults(points, methods, stood)
+        return ConvergenceResults(points, methods, stood, session.mixed_sessions())
 
     def _measured(self, member: Member) -> bool:
         """Whether a member has enough finite samples."""
-        return self.ready and member.end is None and not member.message and len(member.rows) >= FEWEST
+        return self.ready and member.failure is None and len(member.draws) >= FEWEST and not _flaw(member)
 
     def _has_figures(self, member: Member, key: str) -> bool:
         return self._measured(member) and self._whole[key].floor is not None
@@ -344,8 +346,9 @@ class Judgement:
         session = self._session
         reference = session.of(Role.REFERENCE)[0]
         stock = session.judges.get(session.facts["independent"][key] or "")
-        usable = stock is not None and stock.end is None and not stock.message and len(set(stock.turns)) >= FEWEST
-        if usable and stock is not member and stock.method.integrator != member.method.integrator:  # type: ignore[union-attr]
+        if stock is None or stock is member or stock.failure is not None or len(stock.kept) < FEWEST or _flaw(stock):
+            stock = None
+        if stock is not None and stock.request.case.type != member.request.case.type:
             return stock
         return None if member is reference else reference
 
@@ -366,8 +369,8 @@ class Judgement:
         judge, place = self._judge(member, key), self._slices[key]
         if judge is None:
             return _Bias(message="there is no independent reference")
-        ours, theirs = np.stack(member.rows)[:, place].astype(np.float64), self._rows(judge, place)
-        if member.role is not Role.CASE:
+        ours, theirs = member.draws.values[:, place].astype(np.float64), self._rows(judge, place)
+        if member.request.role is not Role.CASE:
             ours = self._rows(member, place)
         figures = compare_expectations(
             ours,
@@ -379,7 +382,7 @@ class Judgement:
         )
         biased = {Verdict.HOLDS: False, Verdict.FAILS: True}.get(figures.verdict)
         message = figures.message or ("gradient and reference differ" if biased else "")
-        return _Bias(biased, figures.z_max, figures.z_max_limit, judge.label, message)
+        return _Bias(biased, figures.z_max, figures.z_max_limit, judge.request.label, message)
 
     def _family(self) -> Family:
         """Return all comparisons of the session, which have a common correction."""
@@ -390,21 +393,20 @@ class Judgement:
     # --- records ------------------------------------------------------------------------------------------------------
 
     def _samples(self, member: Member, key: str) -> MethodSamples:
-        rows = np.stack(member.rows)[:, self._places[key]]
-        return MethodSamples(rows, np.array(member.turns), np.array(member.seconds), self._whole[key])
+        return MethodSamples(member.draws.values[:, self._places[key]], member.turns, member.seconds, self._whole[key])
 
     def _method(
         self, member: Member, key: str, bias: _Bias, references: dict[str, _Bias] | None = None
     ) -> MethodRecord:
-        status = BenchStatus.OK if member.end is None else member.end.status
+        draws = member.draws
+        figures: dict[str, Any] = {"method": _method(member), "parameter": key, "status": member.status}
+        figures |= {"repeats": len(draws), "cold_s": None if draws.cold_ms is None else draws.cold_ms / 1e3}
         if not self._has_figures(member, key):
-            reason = member.message or ("" if member.end is None else member.end.reason)
+            reason = _flaw(member) or ("" if member.failure is None else member.failure.reason)
             if (rounds := self._session.plan.rounds) is not None and rounds < FEWEST:
                 reason = reason or f"results need {FEWEST} rounds; set --rounds"
             reason = reason or ("the budget was spent" if member.late or not self._measured(member) else _UNSEEN)
-            return MethodRecord(
-                member.method, key, status, repeats=len(member.rows), cold_s=member.cold_s, message=reason
-            )
+            return MethodRecord(**figures, message=reason)
         samples, biased = self._samples(member, key), bias.biased is True
         magnitude = samples
         if biased and references is not None and references[key].biased and key != ALL:
@@ -418,12 +420,8 @@ class Judgement:
         times = {f"{target:g}": magnitude.seconds_to(target, biased) for target in TARGETS}
         efficiency = magnitude.efficiency()
         return MethodRecord(
-            method=member.method,
-            parameter=key,
-            status=status,
-            repeats=samples.count,
+            **figures,
             step_s=samples.step_s,
-            cold_s=member.cold_s,
             relative_rmse=float(np.sqrt(samples.variance)),
             reference_rmse=samples.reference.floor,
             slope=samples.slope(),
@@ -438,10 +436,24 @@ class Judgement:
     def _stood(self, member: Member, key: str, bias: _Bias) -> ReferenceRecord:
         floor = self._whole[key].floor
         bias = bias if floor is not None else replace(bias, message=_UNSEEN)
-        return ReferenceRecord(member.method, key, len(member.rows), floor, **vars(bias))
+        return ReferenceRecord(_method(member), key, len(member.draws), floor, **vars(bias))
 
 
 def _kin(member: Member) -> str:
     """Return the source of the code that traces a member's paths: `reslrb` or a stock integrator."""
-    name = member.method.integrator
+    name = member.request.case.type
     return name if name in ("ptracer", "prb") else "ours"
+
+
+def _method(member: Member) -> Method:
+    assert member.request.method is not None, "members of a convergence have one"
+    return member.request.method
+
+
+def _flaw(member: Member) -> str:
+    """Return why draws cannot be used, or an empty text."""
+    wrong = np.count_nonzero(~np.isfinite(member.draws.values), axis=1)
+    if not wrong.any():
+        return ""
+    first = int(np.argmax(wrong > 0))
+    return f"{wrong[first]} entries of step {first + 1} are not finite"

@@ -1,30 +1,28 @@
 """Worker processes that take measurements, from outside (`Process`) and from inside (`run`).
 
-`Process` and `run` exchange JSON objects, one per line, by the standard input and output of the worker. The first
-object describes the case. The worker answers when the case is loaded. Each later object asks for one step. Other
-output of a worker goes to standard error. The end of a worker is detected and reported, and does not end the
-measurement.
+`Process` and `run` exchange dictionaries over a connection. The first one describes the case. The worker answers when
+the case is loaded. Each later one is a question. The output of a worker goes to a file, whose last lines explain a
+crash. The end of a worker is detected and reported, and does not end the measurement.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
-import json
 import logging.handlers
 import os
-import re
-import selectors
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
+from reslrb_cli.backend.doctor import of_system
 from reslrb_cli.errors import BackendError, ConfigError, ReslrbError, is_out_of_memory, mentions_memory
 from reslrb_cli.records.measurements import BenchStatus
 
@@ -62,21 +60,25 @@ class CannotStart(ReslrbError):
 
 
 class Process:
-    """One worker. `first` is the first message to the worker, including `memory_limit` (bytes, or None)."""
+    """One worker. `first` is the first message to the worker, including `memory_limit` (bytes, or None).
+
+    The command gets the descriptor of the worker's connection as its last argument.
+    """
 
     def __init__(self, first: dict[str, Any], command: list[str]) -> None:
         self.limit: int | None = first["memory_limit"]
         self.peak_bytes = 0  # of address space
-        self._buffer = b""
-        with _making:
+        self._connection, theirs = Pipe()
+        with _making, theirs:
             self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
-            self._words = Path(self._folder.name) / "stderr"
+            self._words = Path(self._folder.name) / "output"
             with self._words.open("wb") as words:
                 self._process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
+                    [*command, str(theirs.fileno())],
+                    stdin=subprocess.DEVNULL,
+                    stdout=words,
                     stderr=words,
+                    pass_fds=[theirs.fileno()],
                     start_new_session=True,  # only this process handles Ctrl-C
                 )
             _at_work.append(self)
@@ -84,53 +86,35 @@ class Process:
 
     def ask(self, question: dict[str, Any]) -> None:
         """Send a message. `answer` reports if the process has ended."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.write(json.dumps(question).encode() + b"\n")
-            self._process.stdin.flush()
+        with contextlib.suppress(OSError):
+            self._connection.send(question)
 
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
         """Wait for the next answer. Raises Ended or CannotStart. Raises Stopped after `stop()`."""
-        assert self._process.stdout is not None
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._process.stdout, selectors.EVENT_READ)
-            while b"\n" not in self._buffer:
-                if stop():
-                    raise Stopped
-                self._look_at_memory()
-                if selector.select(POLL_SECONDS):
-                    chunk = os.read(self._process.stdout.fileno(), 1 << 16)
-                    if not chunk:
-                        raise Ended(*self._end())
-                    self._buffer += chunk
-        line, _, self._buffer = self._buffer.partition(b"\n")
-        answer: dict[str, Any] = json.loads(line)
+        while True:
+            if stop():
+                raise Stopped
+            self.peak_bytes = max(self.peak_bytes, memory_of(self._process.pid, "VmPeak"))
+            if self._connection.poll(POLL_SECONDS):
+                break
+        try:
+            answer: dict[str, Any] = self._connection.recv()
+        except (EOFError, OSError):
+            raise Ended(*self._end()) from None
         if answer.get("failure") == "refused":
             raise CannotStart(answer["reason"], answer["exit_code"])
         if "failure" in answer:
-            raise Ended(BenchStatus(answer["failure"]), answer["reason"])
+            raise Ended(answer["failure"], answer["reason"])
         return answer
 
     def close(self) -> None:
         """End the process and remove its files."""
         self._process.kill()
         self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            with contextlib.suppress(BrokenPipeError):
-                stream.close()
+        self._connection.close()
         self._folder.cleanup()
         if self in _at_work:
             _at_work.remove(self)
-
-    def _look_at_memory(self) -> None:
-        try:
-            text = Path(f"/proc/{self._process.pid}/status").read_text()
-        except OSError:
-            return
-        found = re.search(r"^VmPeak:\s+(\d+) kB", text, re.MULTILINE)
-        if found:
-            self.peak_bytes = max(self.peak_bytes, 1024 * int(found[1]))
 
     def _end(self) -> tuple[BenchStatus, str]:
         code = self._process.wait()
@@ -167,6 +151,14 @@ def abandon_all() -> None:
         shutil.rmtree(process._folder.name, ignore_errors=True)
 
 
+def memory_of(process: int, kind: str) -> int:
+    """Return the memory of a process in bytes, or 0 if it is unknown. `kind` is as in /proc: `VmRSS` is the memory now,
+    `VmHWM` the largest so far, and `VmPeak` the largest address space.
+    """
+    found = of_system(f"/proc/{process}/status", kind)
+    return int(found.removesuffix(" kB")) * 1024 if found else 0
+
+
 def last_words(text: str) -> str:
     """Return the most informative line of a process's standard error: Dr.Jit's `>>>` line, or the last line."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
@@ -180,7 +172,7 @@ def last_words(text: str) -> str:
 Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 
 
-def _serve(first: dict[str, Any], does: str, questions: IO[str], answers: IO[str]) -> None:
+def _serve(first: dict[str, Any], does: str, connection: Connection) -> None:
     os.environ |= {
         # Dr.Jit's folders for compiled kernels: a cold step must find none.
         "HOME": first["cache"],
@@ -201,9 +193,16 @@ def _serve(first: dict[str, Any], does: str, questions: IO[str], answers: IO[str
     warnings.setLevel(logging.WARNING)
     logging.getLogger("reslrb_cli").addHandler(warnings)
     opening, answer_to = begin(first)
-    _answer(answers, opening | {"warnings": [record.getMessage() for record in warnings.buffer]})
-    for line in questions:
-        _answer(answers, answer_to(json.loads(line)))
+    connection.send(opening | {"warnings": [record.getMessage() for record in warnings.buffer]})
+    for question in _questions(connection):
+        connection.send(answer_to(question))
+
+
+def _questions(connection: Connection) -> Iterator[dict[str, Any]]:
+    """Yield questions until the other side has closed the connection."""
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            yield connection.recv()
 
 
 def _limit(memory_limit: int | None) -> None:
@@ -232,27 +231,21 @@ def _failure(error: Exception, limited: bool) -> dict[str, Any]:
     }
 
 
-def _answer(answers: IO[str], message: dict[str, Any]) -> None:
-    answers.write(json.dumps(message) + "\n")
-    answers.flush()
-
-
 def run(does: str) -> None:
-    """Answer questions until standard input ends or a failure occurs, then end the process. The last answer describes a
-    failure.
+    """Answer questions until the connection closes or a failure occurs, then end the process. The last answer describes
+    a failure.
 
     `does` is the function that starts the case, as `MODULE:FUNCTION`. The function returns `Begun` for the first
     message.
     """
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    limited, code = False, 0
+    connection, limited, code = Connection(int(sys.argv[-1])), False, 0
     try:
-        first = json.loads(sys.stdin.readline())
+        first = connection.recv()
         limited = first["memory_limit"] is not None
-        _serve(first, does, sys.stdin, answers)
+        _serve(first, does, connection)
     except Exception as error:
-        _answer(answers, _failure(error, limited))
+        connection.send(_failure(error, limited))
         code = 1
+    sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)  # the remaining cleanup may take long, or fail if memory is exhausted

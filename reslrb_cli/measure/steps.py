@@ -1,13 +1,11 @@
-"""What worker processes do (`processes.run`): timed steps of an experiment.
-
-`Stepper` takes the steps of `bench`. For `convergence`, `survey` finds the facts that precede the measurement, and
-`Sampler` takes the steps of a member.
+"""The work of worker processes (`processes.run`): timed steps of an experiment (`Sampler`), and the facts that a
+`convergence` needs (`survey`).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -36,20 +34,50 @@ from reslrb_cli.scene.visibility import interior
 from reslrb_cli.seeds import seed
 
 
-class TimedSteps:
-    """Timed steps of an experiment with its first sensor. The parameters keep their initial values."""
+class Sampler:
+    """Timed steps of an experiment with its first sensor. The parameters keep their initial values.
 
-    def __init__(self, config: Config, scene: Any = None) -> None:
+    `quantity` is the sampled quantity.
+
+    - `step`: nothing. The step has an image G that is known before the image I, and the objective is sum(G * I). G is
+        noise, because its content does not affect the time.
+    - `fixed`: the gradient with dL/dI fixed at one of `adjoints`.
+    - `loss`: the gradient of the experiment's loss with its `run.adjoint`.
+    - `image`: the image.
+
+    `arrays` are the arrays of the survey. A `step` needs none.
+    """
+
+    def __init__(self, config: Config, quantity: str, arrays: Mapping[str, np.ndarray]) -> None:
+        scene = None
+        if quantity == "step":  # without the check of memory, because memory is measured
+            built_in = config.scene.file == small.FILE
+            scene = small.build(config.scene.options) if built_in else load_configured(config)
         self.problem, self.clock = assemble_scene(config.with_exposures_fixed(), scene), StepClock()
-        self.sensor = self.problem.sensors[0]
+        self.quantity, self.sensor, self.view = quantity, self.problem.sensors[0], self.problem.views[0]
+        film = self.problem.scene.sensors()[self.sensor].film()
+        width, height = (int(n) for n in film.crop_size())
+        textures = [self.problem.selection.array(key).shape for key in self.problem.selection.keys]
+        texels = sum(shape[0] * shape[1] for shape in textures if len(shape) == 3)
+        self.size = {"width": width, "height": height, "texels": texels}
+        if "adjoints" in arrays:
+            set_targets([self.view], arrays)
+        inside = arrays.get("mask", np.ones((1, 1, 1), np.float32))
+        self.inside, self.mask = inside != 0, None if inside.all() else to_tensor(inside)
+        self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
+        if quantity == "step":
+            self.adjoints = [_noise(width, height, int(film.base_channels_count()))]
 
-    def gradient(
-        self, seed: int, given: mi.TensorXf | Callable[[mi.TensorXf], mi.Float], spp: int, with_image: bool = True
-    ) -> tuple[dict[str, Any], StepTimes]:
-        """Return the gradients by key, and times of the step alone. `given` is dL/dI, or the loss as a function of the
-        image. Without `with_image`, a step with a known dL/dI renders no image.
+    def step(self, seed: int, spp: int, image: int = 0) -> tuple[np.ndarray, StepTimes]:
+        """Return one sample as a flat float32 array of all parameters (or pixels), and the times of the step alone.
+        `image` selects dL/dI.
         """
         problem = self.problem
+        if self.quantity == "image":
+            with dr.suspend_grad(), self.clock.step() as times:
+                picture = render_image(problem.integrator, problem.scene, self.sensor, seed, spp)
+                dr.eval(picture)
+            return (np.array(picture, np.float32) * self.inside).ravel(), times
         problem.apply()
         for key in problem.selection.keys:
             dr.clear_grad(problem.optimizer[key])
@@ -57,29 +85,63 @@ class TimedSteps:
         common: dict[str, Any] = {"seed": seed, "spp": spp, "params": problem.selection.params}
         with self.clock.step() as times:
             result: StepResult | None = None
-            if callable(given):
-                result = gradient_step(*seen, given, **(problem.config.step_options() | common))
-            elif with_image:
-                result = known_step(*seen, given, **common)
+            if self.quantity == "loss":
+                options = problem.config.step_options() | common
+                result = gradient_step(*seen, lambda seen: masked_loss(self.view, seen, self.mask), **options)
+            elif self.quantity == "fixed":  # the image is not used, so it is not rendered
+                given_step(*seen, self.adjoints[image % len(self.adjoints)], **common)
             else:
-                given_step(*seen, given, **common)
+                result = known_step(*seen, self.adjoints[0], **common)
             gradients = problem.gradients()
             dr.eval(gradients, () if result is None else (result.image, result.loss))
-        return gradients, times
+        keys = problem.selection.keys if self.quantity != "step" else ()
+        return np.concatenate(
+            [np.zeros(0, np.float32), *(np.array(gradients[k], np.float32).ravel() for k in keys)]
+        ), times
 
-    def told(self, answer: dict[str, Any], cold: bool, release: bool) -> dict[str, Any]:
-        """Return the answer for a step. For a `cold` step, the answer includes the peak memory of Dr.Jit's arrays.
-        `release` frees the allocator's cache.
+    def answer(self, question: dict[str, Any], purpose: str) -> dict[str, Any]:
+        """Return `values` (N, P) of steps with the given `numbers`, their times, and the number of `new_kernels`.
+
+        `purpose` selects the seeds. If `cold` is set, the answer also has the peak memory of Dr.Jit's arrays and the
+        thread-local memory of a path. `release` frees the allocator's cache afterwards.
         """
-        if cold:
-            answer["peak_mib"] = peak_mib(dr.backend_v(mi.Float))
+        if question["cold"]:
+            reset_peak()
+        run_seed, found = self.problem.config.run.seed, []
+        for number in question["numbers"]:
+            at = seed(run_seed, number, self.sensor, purpose)
+            found.append(self.step(at, question["spp"], question["image"]))
+        answer: dict[str, Any] = {
+            "values": np.stack([row for row, _ in found]),
+            "step_ms": [times.wall_ms for _, times in found],
+            "kernel_ms": [times.kernel_ms for _, times in found],
+            "codegen_ms": [times.codegen_ms for _, times in found],
+            "new_kernels": sum(times.new_kernels for _, times in found),
+        }
+        if question["cold"]:
+            answer |= {"peak_mib": peak_mib(dr.backend_v(mi.Float)), "scratch_bytes": scratch_bytes(self.clock.history)}
         self.clock.history = []
-        if release:
+        if question["release"]:
             dr.flush_malloc_cache()
         return answer
 
 
-# --- bench ------------------------------------------------------------------------------------------------------------
+def begin(first: dict[str, Any]) -> Begun:
+    """Start the process of a `Request`. The process first reports the size of film and textures. Each question then
+    asks for steps (`Sampler.answer`).
+    """
+    sampler = Sampler(told(first), first["quantity"], first["arrays"])
+    return sampler.size, lambda question: sampler.answer(question, first["purpose"])
+
+
+def _noise(width: int, height: int, channels: int) -> Any:
+    """Return an image (H, W, C) of positive noise, with zeros in the alpha channel."""
+    values = np.random.default_rng(1).uniform(0.5, 1.5, (height, width, channels)).astype(np.float32)
+    if channels in (2, 4):
+        values[:, :, -1] = 0
+    image = mi.TensorXf(values)
+    dr.make_opaque(image)
+    return image
 
 
 _BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}
@@ -109,65 +171,7 @@ def _of_kernel(ir: str) -> int:
     return bits // 8
 
 
-class Stepper(TimedSteps):
-    """The steps of `bench`. The objective is sum(G * I) with an image G that is known before the image I. G is noise,
-    because its content does not affect the time.
-    """
-
-    def __init__(self, config: Config) -> None:
-        built_in = config.scene.file == small.FILE
-        super().__init__(config, small.build(config.scene.options) if built_in else load_configured(config))
-        film = self.problem.scene.sensors()[self.sensor].film()
-        width, height = film.crop_size()
-        self.size = (int(width), int(height))
-        shapes = [self.problem.selection.array(key).shape for key in self.problem.selection.keys]
-        self.texels = sum(shape[0] * shape[1] for shape in shapes if len(shape) == 3)
-        self._given = _noise(*self.size, int(film.base_channels_count()))
-
-    def step(self, round: int, cold: bool, release: bool) -> dict[str, Any]:
-        """Take one step and measure it. For a `cold` step, memory is measured as well. Every step that is not `cold`
-        runs twice, and only the second run is timed. `release` frees the allocator's cache afterwards.
-        """
-        run, new_kernels = self.problem.config.run, 0
-        at = seed(run.seed, round, self.sensor, "image")
-        if cold:
-            reset_peak()
-        else:
-            # Other processes may have changed the caches since the last step, which must not cost this one.
-            new_kernels = self.gradient(at, self._given, run.spp)[1].new_kernels
-        times = self.gradient(at, self._given, run.spp)[1]
-        answer = {
-            "step_ms": times.wall_ms,
-            "kernel_ms": times.kernel_ms,
-            "codegen_ms": times.codegen_ms,
-            "tracing_ms": max(times.wall_ms - times.kernel_ms - times.codegen_ms, 0.0),
-            "new_kernels": new_kernels + times.new_kernels,
-        }
-        if cold:
-            answer["scratch_bytes"] = scratch_bytes(self.clock.history)
-        return self.told(answer, cold, release)
-
-
-def begin_steps(first: dict[str, Any]) -> Begun:
-    """Start the process. The process first reports the size of film and textures. Each question then asks for a
-    step.
-    """
-    stepper = Stepper(told(first))
-    size = {"width": stepper.size[0], "height": stepper.size[1], "texels": stepper.texels}
-    return size, lambda question: stepper.step(question["round"], question["cold"], question["release"])
-
-
-def _noise(width: int, height: int, channels: int) -> Any:
-    """Return an image (H, W, C) of positive noise, with zeros in the alpha channel."""
-    values = np.random.default_rng(1).uniform(0.5, 1.5, (height, width, channels)).astype(np.float32)
-    if channels in (2, 4):
-        values[:, :, -1] = 0
-    image = mi.TensorXf(values)
-    dr.make_opaque(image)
-    return image
-
-
-# --- convergence ------------------------------------------------------------------------------------------------------
+# --- survey -----------------------------------------------------------------------------------------------------------
 
 #: Light paths of the target, and of all images with a fixed dL/dI together.
 PATHS = {"fixed": 2**21, "loss": 2**23}
@@ -177,12 +181,9 @@ _PURPOSE = "convergence, dL/dI"
 
 
 def begin_survey(first: dict[str, Any]) -> Begun:
-    """Start the process. The process first reports the facts of `survey`, and writes the arrays to the file `arrays`.
-    It answers no questions.
-    """
+    """Start the process. The process first reports the facts and the arrays of `survey`. It answers no questions."""
     facts, arrays = survey(assemble_scene(told(first).with_exposures_fixed()), first["objective"])
-    np.savez(first["arrays"], **arrays)  # type: ignore[arg-type]
-    return facts, dict
+    return {"facts": facts, "arrays": arrays}, dict
 
 
 def survey(problem: Problem, objective: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -272,63 +273,3 @@ def _unlike(config: Config) -> str | None:
     if all(options.get(name, value) == value for name, value in alike.items()):
         return None
     return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
-
-
-class Sampler(TimedSteps):
-    """Steps of `convergence`.
-
-    `mode` is the sampled quantity. `fixed` is the gradient with dL/dI fixed at one of `adjoints`. `loss` is the
-    gradient of the experiment's loss with its `run.adjoint`. `image` is the image. `arrays` are the arrays of the
-    survey.
-    """
-
-    def __init__(self, config: Config, mode: str, arrays: dict[str, np.ndarray]) -> None:
-        super().__init__(config)
-        self.mode, self.view = mode, self.problem.views[0]
-        if "adjoints" in arrays:
-            set_targets([self.view], arrays)
-        self.mask = None if arrays["mask"].all() else to_tensor(arrays["mask"])
-        self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
-        self.inside = arrays["mask"] != 0
-
-    def step(self, seed: int, spp: int, image: int) -> tuple[np.ndarray, StepTimes]:
-        """Return one sample as a flat float32 array of all parameters (or pixels), and the times of the step alone."""
-        problem = self.problem
-        if self.mode == "image":
-            with dr.suspend_grad(), self.clock.step() as times:
-                picture = render_image(problem.integrator, problem.scene, self.sensor, seed, spp)
-                dr.eval(picture)
-            return (np.array(picture, np.float32) * self.inside).ravel(), times
-        if self.mode == "fixed":
-            gradients, times = self.gradient(seed, self.adjoints[image % len(self.adjoints)], spp, with_image=False)
-        else:
-            gradients, times = self.gradient(seed, lambda seen: masked_loss(self.view, seen, self.mask), spp)
-        row = [np.array(gradients[key], np.float32).ravel() for key in problem.selection.keys]
-        return np.concatenate(row), times
-
-
-def begin_sampling(first: dict[str, Any]) -> Begun:
-    """Start the process. A request asks for `count` steps from number `start` on, with `spp` samples per pixel.
-
-    The answer has `step_ms` of each step and the number of `new_kernels`. The samples (count, P) go to the file `out`.
-    If `cold` is set, the answer also has the peak memory of Dr.Jit's arrays. `purpose` selects the seeds, and `image`
-    selects dL/dI.
-    """
-    config = told(first)
-    with np.load(first["arrays"]) as arrays:
-        sampler = Sampler(config, first["mode"], {name: arrays[name] for name in arrays.files})
-
-    def answer(question: dict[str, Any]) -> dict[str, Any]:
-        if question["cold"]:
-            reset_peak()
-        rows, taken = [], []
-        for number in range(question["start"], question["start"] + question["count"]):
-            number_seed = seed(config.run.seed, number, sampler.sensor, first["purpose"])
-            row, times = sampler.step(number_seed, question["spp"], question["image"])
-            rows.append(row)
-            taken.append(times)
-        np.save(question["out"], np.stack(rows))
-        reply = {"step_ms": [times.wall_ms for times in taken], "new_kernels": sum(t.new_kernels for t in taken)}
-        return sampler.told(reply, question["cold"], question["release"])
-
-    return {}, answer

@@ -218,11 +218,12 @@ class ReferenceRecord(Line):
 
 @dataclass(frozen=True)
 class SummaryRecord(Line):
-    """Sentence about the best method."""
+    """Sentence about the best method. `remark` is a warning if times of several sessions are compared."""
 
     KIND: ClassVar[str] = "summary"
 
     line: str
+    remark: str = ""
 
 
 class Reference(str, enum.Enum):

@@ -227,7 +227,7 @@ def reference_line(record: ReferenceRecord) -> str:
 
 def result_lines(results: ConvergenceResults) -> list[Line]:
     """Return all records of a convergence, including the closing sentence."""
-    summary = SummaryRecord(closing_sentence(results.methods, results.references))
+    summary = SummaryRecord(closing_sentence(results.methods, results.references), results.remark)
     return [*results.points, *results.methods, *results.references, summary]
 
 

@@ -278,10 +278,10 @@ class Played(Session):
     """Session with simulated processes, and a clock that only these processes advance."""
 
     def __init__(
-        self, plan: ConvergencePlan, folder: Path, stop: Callable[[], bool], say: Callable[[str], None], **given: Any
-    ):
+        self, plan: ConvergencePlan, stop: Callable[[], bool], say: Callable[[str], None], spent_s: float, **given: Any
+    ) -> None:
         stage = Stage()
-        super().__init__(plan, folder, stop, say, stage.start, stage.clock)
+        super().__init__(plan, stop, say, start=stage.start, now=stage.clock, **given)
 
 
 def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

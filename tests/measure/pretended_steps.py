@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.loader import loads
-from reslrb_cli.measure.bench import STEPS
 from reslrb_cli.measure.convergence import Session
+from reslrb_cli.measure.draws import DrawsFile
+from reslrb_cli.measure.engine import STEPS
 from reslrb_cli.measure.judgement import ConvergenceResults, Judgement
 from reslrb_cli.measure.methods import ConvergencePlan, parse_cases
 from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
@@ -30,7 +31,7 @@ class Pretended:
     alive = 0
 
     def __init__(self, first: dict[str, Any], does: str) -> None:
-        assert does == STEPS
+        assert (does, first["quantity"]) == (f"{STEPS}:begin", "step")
         config = loads(first["config"], "x.yaml")
         self.type, self.depth = config.integrator.type, config.integrator.max_depth
         self.asked, self.closed = 0, False
@@ -39,7 +40,7 @@ class Pretended:
 
     def ask(self, question: dict[str, Any]) -> None:
         self.asked, self.question = self.asked + 1, question
-        Pretended.log.append((self.depth, self.type, question["round"]))
+        Pretended.log.append((self.depth, self.type, question["numbers"]))
 
     def answer(self, stop: Callable[[], bool]) -> dict[str, Any]:
         if stop():
@@ -50,9 +51,14 @@ class Pretended:
             raise Ended(BenchStatus.OUT_OF_MEMORY, "ended by SIGSEGV")
         if self.question is None:
             return {"width": 6, "height": 5, "texels": 9}
-        ms = float(self.depth * (1 + self.question["round"]) * {"ptracer": 4, "reslrb": 2, "walk_ad": 5}[self.type])
-        parts = {"kernel_ms": ms / 2, "codegen_ms": ms / 8, "tracing_ms": 3 * ms / 8}
-        answer = {"step_ms": ms, **parts, "new_kernels": 2 if self.asked < 3 else 0}
+        numbers, speed = self.question["numbers"], {"ptracer": 4, "reslrb": 2, "walk_ad": 5}[self.type]
+        # Only the last step of a turn counts. The first one refills caches.
+        ms = np.array([float(self.depth * (2 + number) * speed) for number in numbers])
+        ms[:-1] += 100.0
+        ms /= 1 + self.question["cold"]
+        parts = {"step_ms": ms, "kernel_ms": ms / 2, "codegen_ms": ms / 8}
+        answer = {"values": np.zeros((len(ms), 0)), "new_kernels": 2 if self.asked < 3 else 0}
+        answer |= {name: part.tolist() for name, part in parts.items()}
         return answer | ({"peak_mib": 1.5, "scratch_bytes": 60} if self.question["cold"] else {})
 
     def close(self) -> None:
@@ -103,7 +109,7 @@ class Stage:
     """All methods by `role label` or `label`. Only the methods advance the clock. `start` starts their processes."""
 
     def __init__(self, facts: dict[str, Any] | None = None, **methods: Pretence) -> None:
-        self.now, self.alive, self.survey_s = 0.0, 0, 2.0
+        self.now, self.alive, self.survey_s, self.surveys = 0.0, 0, 2.0, 0
         self.methods = methods
         self.turns: list[str] = []
         self.purposes: list[str] = []
@@ -119,16 +125,18 @@ class Stage:
 
     def start(self, first: dict[str, Any], does: str) -> Player:
         self.alive += 1
+        self.surveys += does.endswith(":begin_survey")
         self.purposes += [first["purpose"]] if "purpose" in first else []
         return Player(self, first, does)
 
     def pretence(self, name: str) -> Pretence:
-        """Return the method of a name such as `case reslrb:stack`. The key is role and label, or label. The default is
-        a plain method.
+        """Return the method of a name such as `case reslrb:stack, 4 spp`. The key may lack the role and the sample
+        count. The default is a plain method.
         """
-        short = name.partition(" ")[2]
-        found = self.methods.get(_plain(name)) or self.methods.get(_plain(short))
-        return found or self.methods.setdefault(_plain(name), Pretence())
+        without = name.rpartition(", ")[0]
+        keys = [_plain(key.partition(" ")[2] if short else key) for key in (name, without) for short in (False, True)]
+        found = next((self.methods[key] for key in keys if key in self.methods), None)
+        return found or self.methods.setdefault(_plain(without), Pretence())
 
 
 def _plain(name: str) -> str:
@@ -153,8 +161,8 @@ class Player:
             raise Stopped
         if self.played is None:
             self._wait(self.stage.survey_s, stop)
-            np.savez(self.first["arrays"], mask=np.ones((2, 2, 1), np.float32))
-            return self.stage.facts | {"warnings": ["old"]}
+            arrays = {"mask": np.ones((2, 2, 1), np.float32)}
+            return {"facts": self.stage.facts, "arrays": arrays, "warnings": ["old"]}
         if self.question is None:
             if self.played.refuses:
                 raise CannotStart("cannot be done here", 2)
@@ -164,18 +172,18 @@ class Player:
         return self._steps(self.played, self.question, stop)
 
     def _steps(self, played: Pretence, question: dict[str, Any], stop: Callable[[], bool]) -> dict[str, Any]:
-        cold, numbers = question["cold"], range(question["start"], question["start"] + question["count"])
+        cold, numbers = question["cold"], question["numbers"]
         self._wait(played.cold_s if cold else len(numbers) * played.step_s, stop)
-        played.steps += numbers
-        if not cold:
+        if len(numbers) > 1:
+            played.steps += numbers
             self.stage.turns.append(self.name)
         rows = np.stack([played.sample(self.first["purpose"], n, question["image"] % 8) for n in numbers])
         if played.nan_at in numbers:
             rows[0, 1] = np.nan
-        np.save(question["out"], rows)
         ms = 1e3 * (played.cold_s if cold else played.step_s)
-        times = [ms + 1e3 * played.late_s, *[ms] * (len(numbers) - 1)]
-        return {"step_ms": times, "new_kernels": int(cold), "peak_mib": 2.0}
+        times = [ms + 1e3 * played.late_s * (len(numbers) > 1), *[ms] * (len(numbers) - 1)]
+        answer = {"values": rows, "step_ms": times, "kernel_ms": times, "codegen_ms": times, "new_kernels": int(cold)}
+        return answer | ({"peak_mib": 2.0, "scratch_bytes": 8} if cold else {})
 
     def _wait(self, seconds: float, stop: Callable[[], bool]) -> None:
         for _ in range(max(round(seconds / 0.05), 1)):
@@ -209,10 +217,10 @@ def plan(cases: str = LIST, **changes: Any) -> ConvergencePlan:
 
 
 def play(
-    folder: Path, stage: Stage, what: ConvergencePlan, stop: Callable[[], bool] = lambda: False
+    stage: Stage, what: ConvergencePlan, stop: Callable[[], bool] = lambda: False, file: Path | None = None
 ) -> tuple[Session, ConvergenceResults, list[str]]:
     said: list[str] = []
-    session = Session(what, folder, stop, said.append, stage.start, stage.clock)
+    session = Session(what, stop, said.append, start=stage.start, now=stage.clock, file=DrawsFile(file))
     for _ in session.run():
         pass
     assert stage.alive == 0

@@ -161,13 +161,16 @@ MASKED = scene(
 # How the end of a process is interpreted, and what kernels report about thread-local memory.
 
 FIRST = {"memory_limit": None}
+CHILD = """
+import os, signal, sys, time
+from multiprocessing.connection import Connection
+parent = Connection(int(sys.argv[-1]))
+"""
 FAILED, OUT_OF_MEMORY = BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY
 
 
 def end_of(script: str, limit: int | None = None) -> Ended:
-    process = Process(
-        {"memory_limit": limit}, command=[sys.executable, "-c", f"import json, os, signal, sys, time\n{script}"]
-    )
+    process = Process({"memory_limit": limit}, command=[sys.executable, "-c", f"{CHILD}\n{script}"])
     try:
         with pytest.raises(Ended) as caught:
             process.answer(lambda: False)
@@ -185,7 +188,7 @@ def end_of(script: str, limit: int | None = None) -> Ended:
         ("raise ValueError('of all things')", FAILED, "ended by exit code 1: ValueError: of all things"),
         ("sys.stderr.write('std::bad_alloc\\n'); sys.stderr.flush(); os.abort()", OUT_OF_MEMORY, "SIGABRT: std::bad"),
         ("sys.stderr.write('>>> jit_malloc(): out of memory!\\nir\\n'); sys.exit(1)", OUT_OF_MEMORY, "1: jit_malloc()"),
-        ("print(json.dumps({'failure': 'failed', 'reason': 'why'}), flush=True); time.sleep(9)", FAILED, "why"),
+        ("parent.send({'failure': 'failed', 'reason': 'why'}); time.sleep(9)", FAILED, "why"),
     ],
 )
 def test_kinds_of_ends_are_distinguished(script: str, status: BenchStatus, reason: str) -> None:
@@ -204,7 +207,7 @@ def test_a_crash_near_the_limit_is_attributed_to_memory() -> None:
 
 def test_a_refusal_applies_to_all() -> None:
     answer = {"failure": "refused", "reason": "x.yaml: scene.file: no such file", "exit_code": 2}
-    process = Process(FIRST, command=[sys.executable, "-c", f"import json; print(json.dumps({answer!r}))"])
+    process = Process(FIRST, command=[sys.executable, "-c", f"{CHILD}\nparent.send({answer!r})"])
     with pytest.raises(CannotStart, match=r"scene\.file: no such file") as caught:
         process.answer(lambda: False)
     assert caught.value.exit_code == 2

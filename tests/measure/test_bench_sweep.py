@@ -11,9 +11,9 @@ from measure.pretended_steps import Pretended
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure import arena
-from reslrb_cli.measure.arena import MAX_ROUNDS, MIN_ROUNDS, NO_TIME, Pace
-from reslrb_cli.measure.bench import Bench, BenchResult
+from reslrb_cli.measure import engine
+from reslrb_cli.measure.bench import MAX_ROUNDS, Bench, BenchResult
+from reslrb_cli.measure.engine import MIN_ROUNDS, NO_TIME, Pace
 from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
 from reslrb_cli.measure.processes import CannotStart, Stopped
 from reslrb_cli.records.measurements import BenchStatus, Spread
@@ -50,7 +50,7 @@ def play(
     what: Sweep, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
 ) -> tuple[list[BenchResult], list[str]]:
     said: list[str] = []
-    rows = [row for depth in Bench(what, Path(), stop, said.append, kind, **options).run() for row in depth]
+    rows = [row for depth in Bench(what, stop, said.append, start=kind, **options).run() for row in depth]
     assert Pretended.alive == 0
     return rows, said
 
@@ -62,8 +62,9 @@ def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[BenchResu
 def test_steps_are_interleaved_in_rotating_order() -> None:
     run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
-    warm = [(2, name, 0) for name in types for _ in range(3)]  # one cold step, then two until no kernel is new
-    rounds = [(2, types[(r + k) % 3], r + 1) for r in range(MIN_ROUNDS) for k in range(3)]
+    # One cold step, then two until no kernel is new. All but the cold one refill caches first.
+    warm = [(2, name, numbers) for name in types for numbers in ([0], [0, 0], [0, 0])]
+    rounds = [(2, types[(r + k) % 3], [r, r]) for r in range(MIN_ROUNDS) for k in range(3)]
     assert Pretended.log == warm + rounds
 
 
@@ -137,21 +138,23 @@ def test_cases_that_need_shared_memory_release_it(monkeypatch: pytest.MonkeyPatc
             super().ask(question)
 
     for mib in (5, 500):
-        monkeypatch.setattr(arena, "memory_bytes", lambda variant, mib=mib: mib * 2**20)
+        monkeypatch.setattr(engine, "memory_bytes", lambda variant, mib=mib: mib * 2**20)
         play(sweep(values=[2]), Noting)
         assert asked[-1] == (mib == 5)
 
 
 def test_pace_divides_the_budget() -> None:
     now = [0.0]
-    pace, spent = Pace(100.0, 3, now=lambda: now[0]), Pace(200.0, 2, now=lambda: now[0])
+    pace, spent = (
+        Pace(seconds, depths, None, MAX_ROUNDS, lambda: now[0]) for seconds, depths in ((100.0, 3), (200.0, 2))
+    )
 
     def rounds(begin_s: float, round_s: float, pace: Pace = pace) -> int:
         pace.begin_depth()
         now[0] += begin_s
         pace.begin_rounds()
         done = 0
-        while pace.another(done):
+        while pace.another(done, done):
             now[0] += round_s
             done += 1
         return done
@@ -163,11 +166,13 @@ def test_pace_divides_the_budget() -> None:
     assert rounds(1.0, 5.0) == 9
     assert 95.0 < now[0] <= 100.0
     assert rounds(1.0, 30.0, spent) == MIN_ROUNDS
-    assert rounds(1.0, 50.0, Pace(100.0, 1, now=lambda: now[0])) == 1  # a second round would exceed the whole budget
-    assert rounds(1.0, 50.0, Pace(0.0, 1, rounds=7, now=lambda: now[0])) == 7
-    cheap = Pace(1e6, 1, now=lambda: 0.0)
+    assert (
+        rounds(1.0, 50.0, Pace(100.0, 1, None, MAX_ROUNDS, lambda: now[0])) == 1
+    )  # a second round would exceed the whole budget
+    assert rounds(1.0, 50.0, Pace(0.0, 1, 7, MAX_ROUNDS, lambda: now[0])) == 7
+    cheap = Pace(1e6, 1, None, MAX_ROUNDS, lambda: 0.0)
     cheap.begin_depth()
-    assert [cheap.another(done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
+    assert [cheap.another(done, done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -336,6 +341,6 @@ def test_default_values() -> None:
 
 def test_results_grow_with_each_round() -> None:
     """The command writes its file after each round, so that a killed process loses only its last round."""
-    made = Bench(sweep(values=[2]), Path(), lambda: False, lambda line: None, Pretended)
+    made = Bench(sweep(values=[2]), lambda: False, lambda line: None, start=Pretended)
     seen = [[result.record.repeats for result in made.results()] for _ in made.run()]
     assert seen == [[1] * 3, [2] * 3, [3] * 3, [3] * 3]

@@ -175,10 +175,10 @@ def test_a_situation_has_everything_that_determines_a_draw(
 
 
 def test_differences_name_the_parts_of_a_situation() -> None:
-    file = DrawsFile()
-    file.add({"settings": "a", "spp": 4, "files": {}}, some(1))
-    file.add({"settings": "b", "spp": 8, "files": {}}, some(1))
-    assert file.differences({"settings": "a", "spp": 4, "files": {}}, "prb") == []
-    assert file.differences({"settings": "a", "spp": 8, "files": {"x": "1"}}, "prb") == ["spp", "files"]
-    assert file.differences({"settings": "c", "spp": 8, "files": {}}, "prb") == ["settings"]
-    assert file.differences({"settings": "c", "spp": 8, "files": {}}, "ptracer") == []
+    file, usual = DrawsFile(), {"purpose": "prb", "settings": "a", "spp": 4, "files": {}}
+    file.add(usual, some(1))
+    file.add(usual | {"settings": "b", "spp": 8}, some(1))
+    assert file.differences(usual) == []
+    assert file.differences(usual | {"spp": 8, "files": {"x": "1"}}) == ["spp", "files"]
+    assert file.differences(usual | {"settings": "c", "spp": 8}) == ["settings"]
+    assert file.differences(usual | {"settings": "c", "purpose": "ptracer"}) == []

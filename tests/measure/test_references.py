@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from cli.test_optimize import KEY
 from measure import pretended_steps
 
-from reslrb_cli.measure.convergence import Role
+from reslrb_cli.measure.engine import Role
 from reslrb_cli.measure.methods import REFERENCE, parse_cases
 from reslrb_cli.optimization.autotune import race
 
@@ -58,15 +56,15 @@ def test_gradients_without_light_are_undecided():
     [("light", "reslrb:stack", None), ("camera", "reslrb:stack(paths=camera)", None),
      ("both", "reslrb:stack(paths=both,light_share=0.5)", 0.5)],
 )  # fmt: skip
-def test_errors_refer_to_all_light_of_the_scene(tmp_path: Path, paths: str, label: str, share: float | None) -> None:
+def test_errors_refer_to_all_light_of_the_scene(paths: str, label: str, share: float | None) -> None:
     """Methods of the default list that need paths the scene lacks are left out, and a message names them."""
     stage = pretended_steps.Stage(facts={"paths": paths})
     usual = pretended_steps.plan(
         "reslrb:stack,reslrb:stack(paths=both)", rounds=3, reference=parse_cases(REFERENCE)[0], default=True
     )
-    session, results, said = pretended_steps.play(tmp_path, stage, usual)
+    session, results, said = pretended_steps.play(stage, usual)
     method = results.references[0].method
     assert (method.label, method.paths, method.light_share) == (label, paths, share)
-    assert session.of(Role.REFERENCE)[0].config.integrator.options()["paths"] == paths
+    assert session.of(Role.REFERENCE)[0].request.config.integrator.options()["paths"] == paths
     left_out = "left out: reslrb:stack(paths=both): this scene has only light paths"
     assert (left_out in said) == (paths == "light")
