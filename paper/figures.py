@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from benchmarks_measure import ROOT, code_state, draw_bench, read_lines
+from benchmarks_measure import ROOT, code_state, draw, read_lines
 
 from paper import page
 from reslrb_cli.backend.doctor import device_name
@@ -109,7 +109,7 @@ def _bench(options: argparse.Namespace, others: list[str]) -> int:
             lines = read_lines(record)
             lines[0] |= {"command": ["scripts/paper", "figure6", "ROOM", *others]} | code_state()
             file.write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
-            draw_bench(lines, file.with_suffix(".png"))
+            draw(file, file.with_suffix(".png"))
     return code
 
 

@@ -7,7 +7,7 @@ chooses the libLLVM that Dr.Jit loads.
 - `optimize` recovers parameters in your own loop.
 - `render`, `gradient`, `gradcheck`, `convergence`, `bench` and `export` run the commands of the same name on an
   experiment.
-- `write_report` writes a page about runs and measurements.
+- `write_report` writes a page, a figure or a table about runs and measurements, and `table` returns their arrays.
 - `ReslrbError` is the base class of the errors that these raise.
 - `Callback` receives the progress of a run; `TensorBoard`, `MLflow` and `WandB` log it.
 - `register` registers the plugins with Mitsuba.
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from reslrb_cli.integrators.plugin import register
     from reslrb_cli.integrators.step import gradient_step as step
     from reslrb_cli.records.metrics import Record
+    from reslrb_cli.report.publish import table
     from reslrb_cli.runs.callbacks import Callback, RunInfo
     from reslrb_cli.runs.loggers import MLflow, TensorBoard, WandB
     from reslrb_cli.scene.load import load_for_script as load_scene
@@ -98,6 +99,7 @@ __all__ = [
     "register_estimator",
     "render",
     "step",
+    "table",
     "torch",
     "write_report",
 ]
@@ -122,6 +124,7 @@ _LAZY = {
     "register": ("reslrb_cli.integrators.plugin", "register"),
     "register_estimator": ("reslrb_cli.estimators", "register_estimator"),
     "step": ("reslrb_cli.integrators.step", "gradient_step"),
+    "table": ("reslrb_cli.report.publish", "table"),
     "torch": ("reslrb_cli.api.torch", ""),  # the module
 }  # fmt: skip
 

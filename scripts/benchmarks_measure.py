@@ -246,28 +246,15 @@ def measure(name: str, words: Sequence[str]) -> None:
             lines = [lines[0], {"kind": "suite"} | counts]
         record_file(name).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
         if name == "depth":
-            draw_bench(lines, ROOT / "docs" / "images" / "bench.png")
+            draw(record_file(name), ROOT / "docs" / "images" / "bench.png")
 
 
-def draw_bench(lines: Sequence[Mapping[str, Any]], picture: Path) -> None:
-    """Draw the time and memory of a step against path depth, from the lines of a record."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def draw(record: Path, picture: Path) -> None:
+    """Draw the figure of a record of `reslrb bench`."""
+    from reslrb_cli.report.publish import write
+    from reslrb_cli.report.sources import read_sources
 
-    from reslrb_cli.report.page.measured import curves_of, label
-    from reslrb_cli.report.plots import draw
-
-    origin, rows = lines[0], [line for line in lines[1:] if line["status"] == "ok"]
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    shown = {"time of a step (ms)": "step_ms", "peak memory (MiB)": "peak_mib"}
-    for axis, (words, figures) in zip(figure.subplots(1, 2), shown.items(), strict=True):
-        draw(axis, curves_of(rows, list(dict.fromkeys(map(label, rows))), label, "max_depth", figures), 2)
-        axis.legend(fontsize="small")
-        axis.set(xlabel="path depth", ylabel=words)
-        axis.grid(True, which="both", alpha=0.25)
-    figure.suptitle(f"{origin['device']}, {origin['variant']}", fontsize="medium")
-    figure.savefig(picture, dpi=150)
+    write(read_sources([record]), picture, "draw")
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -291,7 +291,7 @@ def test_a_measurement_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert record.origin["seconds"] > 0
     assert {name: record.origin[name] for name in ("commit", "clean")} == benchmarks_measure.code_state()
     assert [row["status"] for row in record.rows] == ["ok"]
-    benchmarks_measure.draw_bench([record.origin, *record.rows], tmp_path / "tiny.png")
+    benchmarks_measure.draw(tmp_path / "tiny.jsonl", tmp_path / "tiny.png")
     assert (tmp_path / "tiny.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(SystemExit, match="exit code 2; its record is left as it was"):
         benchmarks_measure.measure("tiny", ("--nonsense",))

@@ -546,26 +546,23 @@ def _check_counts(**options: Sequence[int | None]) -> None:
 
 
 def write_report(
-    sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]], page: str | os.PathLike[str]
+    sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Sequence[Line], path: str | os.PathLike[str]
 ) -> Path:
-    """Write one self-contained HTML page about runs and measurements, as `reslrb report` does (docs/report.md). Return
+    """Write a page, a figure or a table about runs and measurements, as `reslrb report` does (docs/report.md). Return
     its path.
 
     `sources` are run folders, folders of sweeps, and files that `bench`, `gradcheck` and `convergence` wrote with
-    `--json`. `page` is the file to write. Raises ConfigError.
+    `--json`, or the records that one of these functions returned. `path` is the file to write. Its suffix selects the
+    output: a page (`.html`), a figure (`.pdf`, `.svg`, `.png`) or a table (`.csv`, `.tex`). Raises ConfigError.
     """
     with called():
-        given = [sources] if isinstance(sources, (str, os.PathLike)) else list(sources)
-        paths = [as_path(each, "sources", "the path of a run folder, or of a file of measurements") for each in given]
         load_packages()  # Mitsuba reads the images
-        from reslrb_cli.report.page import write_page
-        from reslrb_cli.report.sources import read_sources
+        from reslrb_cli.report.publish import as_sources, write
 
-        path = as_path(page, "page", "the path of a file")
-        found = read_sources(paths)
-        with writing("page", path):
-            write_page(found, path)
-        return path
+        file, found = as_path(path, "path", "the path of a file"), as_sources(sources)
+        with writing("path", file):
+            write(found, file, "path")
+        return file
 
 
 def export(run: str | os.PathLike[str], folder: str | os.PathLike[str], tolerances: bool = False) -> Path:

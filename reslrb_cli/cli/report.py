@@ -1,4 +1,4 @@
-"""`reslrb report`: one page about runs and measurements."""
+"""`reslrb report`: a page, a figure or a table about runs and measurements."""
 
 from __future__ import annotations
 
@@ -18,20 +18,24 @@ MOST_SOURCES = 100
 
 @click.command("report")
 @click.argument("paths", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="PAGE",
-              help="HTML file to write. Default for one run or sweep: its own page.")  # fmt: skip
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="FILE",
+              help=
+        "File to write: a page (.html), a figure (.pdf, .svg, .png) or a table (.csv, .tex). Default for one run "
+        "or sweep: its own page.")  # fmt: skip
 def command(paths: tuple[Path, ...], output: Path | None) -> int:
-    """Write one self-contained page about runs and measurements.
+    """Write a page, a figure or a table about runs and measurements.
 
     RUN is a run folder of `optimize`, a folder of a `sweep`, or a file that `bench`, `gradcheck` or `convergence` wrote
-    with --json. Several of these follow one another. A sweep compares its runs. Unfinished runs are shown up to their
-    last iteration.
+    with --json. On a page, several of these follow one another. Unfinished runs are shown up to their last iteration.
+
+    The suffix of FILE selects the output. Figures show error against time for convergences and sweeps, and time and
+    memory against depth for benches. Convergences of several depths give efficiency against depth.
     """
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # Mitsuba reads the images
     from reslrb_cli.records.sweeps import PAGE_FILE
-    from reslrb_cli.report.page import write_page
+    from reslrb_cli.report.publish import write
     from reslrb_cli.report.sources import ShownRun, SweepRuns, read_sources
 
     if len(paths) > MOST_SOURCES:
@@ -45,9 +49,9 @@ def command(paths: tuple[Path, ...], output: Path | None) -> int:
     gc.freeze()
     if output is None:
         if len(sources) != 1 or not isinstance(sources[0], ShownRun | SweepRuns):
-            raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html")
+            raise ConfigError("--output", "", "is missing; give a file to write, e.g. -o page.html or -o figure.pdf")
         output = sources[0].path / ("report.html" if isinstance(sources[0], ShownRun) else PAGE_FILE)
     check_writable("--output", output)
-    write_page(sources, output)
+    write(sources, output, "--output")
     echo(f"look at {os.path.relpath(output)}")
     return ExitCode.DONE

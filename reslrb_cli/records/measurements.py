@@ -476,6 +476,8 @@ def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
     """Return the record of class `kind` in `entry`, which is a line read from a file. Return None if the line holds no
     such record. Keys that the class does not have are left out, because a later version may have written them.
     """
+    if "method" in kind.__annotations__:  # its fields are in the line itself
+        entry = {**entry, "method": entry}
     try:
         found: R = _reader(kind).validate_python(entry)  # type: ignore[arg-type]  # types are hashable
     except ValidationError:

@@ -39,11 +39,35 @@ def with_error(value: float, error: float, sign: str = "+-") -> str:
     return text if scale == 0 else f"({text})e{scale:+03d}"
 
 
-def interval(value: float, low: float, high: float, digits: int | str) -> str:
-    """Return a value and its interval. `digits` is the number of significant digits, or a format."""
-    first, *ends = (
-        number(each, digits) if isinstance(digits, int) else f"{each:{digits}}" for each in (value, low, high)
-    )
+#: An uncertainty is rounded to two digits below this number, times a power of ten, and to one digit from it on. This is
+#: the rule of the Particle Data Group.
+LEAST_WITH_ONE_DIGIT = 3.55
+
+
+def rounded(value: float, low: float, high: float) -> tuple[str, str, str]:
+    """Return a value and the ends of its interval, rounded to the digits that the interval supports, but to at least
+    two digits each: `0.583 [0.571, 0.596]` or `420 [150, 1200]`.
+    """
+    half = (high - low) / 2
+    if not 0 < half < math.inf:
+        return number(value), number(low), number(high)
+    place = math.floor(math.log10(half))
+    place -= half < LEAST_WITH_ONE_DIGIT * 10.0**place
+    return _at(value, place), _at(low, place), _at(high, place)
+
+
+def _at(value: float, place: int) -> str:
+    """Return a number, rounded at the decimal `place` or at its second digit, whichever is finer."""
+    size = math.floor(math.log10(abs(value))) if value else place
+    place = min(place, size - 1) if value else place
+    if -4 <= size < math.log10(LEAST_WITH_EXPONENT):
+        return f"{round(value, -place):.{max(-place, 0)}f}"
+    return f"{value:.{size - place}e}"
+
+
+def interval(value: float, low: float, high: float) -> str:
+    """Return a value and its interval, as in `rounded`."""
+    first, *ends = rounded(value, low, high)
     return f"{first} [{', '.join(ends)}]"
 
 

@@ -161,7 +161,7 @@ def read_sweep_runs(folder: Path, name: str | None = None) -> SweepRuns:
 
 def _read_file(path: Path, name: str) -> Measurements:
     objects = read_lines(path)
-    kind = next((kind for entry in objects if (kind := _kind(entry)) is not None), None)
+    kind = next((kind for entry in objects if (kind := kind_of(entry)) is not None), None)
     if kind is None:
         reason = (
             "holds no line that bench, gradcheck or convergence wrote; give a file that --json wrote, or a run folder"
@@ -172,7 +172,7 @@ def _read_file(path: Path, name: str) -> Measurements:
     return Measurements(path, name, kind, others, origins)
 
 
-def _kind(entry: Mapping[str, Any]) -> str | None:
+def kind_of(entry: Mapping[str, Any]) -> str | None:
     """Return the command that wrote a line, or None if unknown."""
     if entry.get("kind") in ("point", "method"):
         return "convergence"

@@ -33,7 +33,7 @@ def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
     """
     titles = (swept, "", "step ms", "over baseline", "kernel ms", "over baseline", "codegen", "tracing", "cold ms",
               "peak MiB", "scratch B", "n")  # fmt: skip
-    return Columns(titles, (7, max(map(len, labels)), 9, 19, 9, 19, 7, 7, 8, 9, 9, 3), "><>")
+    return Columns(titles, (7, max(map(len, labels)), 9, 21, 9, 21, 7, 7, 8, 9, 9, 3), "><>")
 
 
 def bench_cells(row: BenchResult) -> tuple[str, ...]:
@@ -53,7 +53,7 @@ def _milliseconds(time: Spread | None) -> str:
 
 
 def _ratio(ratio: Spread | None) -> str:
-    return "" if ratio is None else interval(ratio.median, ratio.min, ratio.max, ".2f")
+    return "" if ratio is None else interval(ratio.median, ratio.min, ratio.max)
 
 
 HEAD = ("parameter", "integrator", "reference", "seeds", "rel. L2", "z rms", "max |z|", "cosine", "variance",
@@ -182,7 +182,7 @@ def _figure(record: MethodRecord, name: str) -> str:
     if name == "bias_z":
         return _deviation(record)
     if isinstance(value, Range):
-        return interval(value.value, value.low, value.high, 3)
+        return interval(value.value, value.low, value.high)
     return number(value, 3) if value is None or isinstance(value, float) else str(value)
 
 
@@ -295,4 +295,4 @@ def _efficiency_ratio(one: MethodRecord, other: MethodRecord, pairs: int) -> tup
 
 
 def _times(one: MethodRecord, other: MethodRecord, pairs: int) -> str:
-    return interval(*_efficiency_ratio(one, other, pairs), 2)
+    return interval(*_efficiency_ratio(one, other, pairs))

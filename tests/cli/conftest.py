@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import pytest
 from cli.tiny import write_experiment
@@ -12,22 +12,22 @@ from reslrb_cli.cli import main
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.report.page import values
 from reslrb_cli.report.page.layout import diagram
-from reslrb_cli.report.plots import Curve
+from reslrb_cli.report.plots import Panel
 from reslrb_cli.runs import recorder as recording
 
-#: Diagrams that earlier tests drew, by caption and label.
+#: Diagrams that earlier tests drew, by the labels of their axes.
 DRAWN: dict[tuple[str, str], str] = {}
 
 
-def drawn_once(made: Sequence[Curve], caption: str, label: str) -> str:
-    """Return the first diagram that was drawn with this caption and label, for all sets of curves with data. Drawing
-    takes longer than these runs.
+def drawn_once(panel: Panel) -> str:
+    """Return the first diagram that was drawn with these labels, for all sets of curves with data. Drawing takes longer
+    than these runs.
     """
-    if not any(len(curve.known()) for curve in made):
-        return diagram(made, caption, label)
-    if (caption, label) not in DRAWN:
-        DRAWN[caption, label] = diagram(made, caption, label)
-    return DRAWN[caption, label]
+    if not panel.shown():
+        return diagram(panel)
+    if (panel.x, panel.y) not in DRAWN:
+        DRAWN[panel.x, panel.y] = diagram(panel)
+    return DRAWN[panel.x, panel.y]
 
 
 @pytest.fixture(autouse=True)

@@ -36,8 +36,8 @@ from reslrb_cli.records.sweeps import (
     run_name,
     short_keys,
 )
-from reslrb_cli.report.page import sweep as curves
 from reslrb_cli.report.page.sweep import best_records, incomparable, lines, notes, row_records, run_records
+from reslrb_cli.report.panels import run_panels
 from reslrb_cli.report.sources import ShownRun, read_sweep_runs
 from reslrb_cli.runs import recorder as recording
 from reslrb_cli.runs import sweep as plans
@@ -513,14 +513,32 @@ def test_curves_are_medians_with_minimum_and_maximum():
     for number, (times, losses) in enumerate(
         [([1.0], [9.0]), ([2.0, 3.0], [7.0, 5.0]), ([0.5, 1.5, 4.0, 5.0], range(4))]
     ):
-        records = [{"elapsed_s": at, "loss": float(loss)} for at, loss in zip(times, losses, strict=True)]
+        records = [{"elapsed_s": at, "loss": float(loss), "parameter_rmse": None}
+                   for at, loss in zip(times, losses, strict=True)]  # fmt: skip
         runs.append(ShownRun(Path(), str(number), {}, records))
-    curve = curves._median("", 0, *curves._by_iteration(runs, "loss"))
-    assert (curve.xs, curve.ys, [end.tolist() for end in curve.band]) == ([0], [7.0], [[0.0], [9.0]])
-    curve = curves._median("", 0, *curves._by_time(runs, "loss"))
+    by_iteration, by_time, *errors = run_panels(["a"], [runs])
+    (curve,) = by_iteration.shown()
+    assert (curve.name, curve.xs, curve.ys, curve.band) == ("a", [0], [7.0], ([0.0], [9.0]))
+    (curve,) = by_time.shown()
     assert curve.xs == [2.0, 3.0, 4.0, 5.0]
     assert curve.ys == [7.0, 5.0, 5.0, 5.0]
-    assert [end.tolist() for end in curve.band] == [[1.0, 1.0, 2.0, 3.0], [9.0] * 4]
+    assert curve.band == ([1.0, 1.0, 2.0, 3.0], [9.0] * 4)
+    assert not any(panel.shown() for panel in errors)
+
+
+def test_errors_without_a_common_unit_are_relative():
+    """A radius (true value 2) and an index (true value 1.5): the root mean square of the relative errors is drawn."""
+    parameters = {"a.radius": {"scale": 2.0}, "a.index": {"scale": 1.5}, "a.unknown": {"scale": None}}
+    results = {"parameters": parameters, "parameter_rmse": {"a.radius": {}}, "rmse": {"initial": None}}
+    records = [
+        {"elapsed_s": at, "loss": 1.0, "parameter_rmse": None,
+         "parameter_errors": {"a.radius": error, "a.index": 0.0, "a.unknown": 7.0}}
+        for at, error in ((1.0, 0.4), (2.0, 0.2))
+    ]  # fmt: skip
+    panel = run_panels(["a"], [[ShownRun(Path(), "a", {"results": results}, records)]])[-1]
+    assert (panel.x, panel.y) == ("time in steps and updates (s)", "relative error of the parameters")
+    (curve,) = panel.shown()
+    assert curve.ys == pytest.approx([0.2 / 2**0.5, 0.1 / 2**0.5])
 
 
 @pytest.mark.long

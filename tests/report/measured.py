@@ -23,6 +23,7 @@ from reslrb_cli.records.measurements import (
     Verdict,
 )
 from reslrb_cli.records.metrics import MetricsWriter
+from reslrb_cli.records.sweeps import Combination, SweepPlan, run_name
 from reslrb_cli.report.tonemap import write_error_map
 
 # Files as `bench`, `gradcheck` and `convergence` write them, made without any measurement.
@@ -155,3 +156,13 @@ def make_run(folder, keys=(FLOOR, LAMP), sensors=1, truth=True, iterations=30, s
             step = {"step_ms": 90.0, "elapsed_s": 0.1 * number + 0.1}
             metrics.write(make_record(iteration=number, loss=0.9**number, parameter_errors=known, **step))
     return Path(folder)
+
+
+def write_sweep(folder, seeds=1):
+    """Write a sweep of two combinations, with finished runs."""
+    combinations = [Combination(f"spp={spp}", {"run.spp": spp}) for spp in (4, 8)]
+    plan = SweepPlan("a.yaml", [], combinations, list(range(seeds)))
+    for combination, seed in plan.runs:
+        make_run(folder / run_name(combination, seed), results={"image_loss": {"initial": 1.0, "final": 0.5}})
+    plan.write(folder)
+    return folder

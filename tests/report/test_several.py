@@ -6,7 +6,11 @@ import json
 import re
 from pathlib import Path
 
+import colour
+import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from report.measured import (
     LAMP,
     ORIGIN,
@@ -16,17 +20,18 @@ from report.measured import (
     write_bench,
     write_convergence,
     write_gradcheck,
+    write_sweep,
 )
 from report.test_page import EVIL, Page
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.manifest import Status
-from reslrb_cli.records.sweeps import Combination, SweepPlan, run_name
 from reslrb_cli.report.page import render
-from reslrb_cli.report.page.measured import label
+from reslrb_cli.report.page.layout import diagram
 from reslrb_cli.report.page.run import DAMAGED
-from reslrb_cli.report.plots import COLORS
+from reslrb_cli.report.panels import convergence_panels, label, method_naming
+from reslrb_cli.report.plots import COLORS, MARKERS, draw
 from reslrb_cli.report.sources import Measurements, ShownRun, read_sources
 
 # One page about several runs and measurements: its content, and damaged or hostile input.
@@ -102,7 +107,7 @@ def test_a_bench(tmp_path):
     title = "Cost of a step: x.jsonl"
     assert page.cells[title][0][:3] == ["integrator", "path depth", "step"]
     assert page.cells[title][-2][:3] == ["ptracer", "8", "out of memory"]
-    assert page.cells[title][-1][:3] == ["reslrb:reservoir", "8", "8 ms [7.2, 9.6]"]
+    assert page.cells[title][-1][:3] == ["reslrb:reservoir", "8", "8.0 ms [7.2, 9.6]"]
     assert lines_drawn(markup) == [list(COLORS[:2])] * 2
     assert "samples per pixel 4" in page.sections[title]
 
@@ -129,7 +134,7 @@ def test_a_convergence(tmp_path):
     page = Page(markup)
     title = "Error against run time: c.jsonl"
     assert page.row(title, "ptracer, independent")[1:] == [
-        "-0.5 [-0.55, -0.45]", "4 [3, 5]", "0.7 < 4.5", "3.5 s", "2 min 0 s extrapolated", "—"]  # fmt: skip
+        "-0.50 [-0.55, -0.45]", "4.0 [3.0, 5.0]", "0.7 < 4.5", "3.5 s", "2 min 0 s extrapolated", "—"]  # fmt: skip
     assert page.row(title, "reslrb:stack")[:2] == ["reslrb:stack, independent biased", "-0.5"]
     assert page.row(title, "prb")[1:3] == ["out of memory", ""]
     assert "reslrb:stack, independent: too few <steps>" in page.sections[title]
@@ -148,6 +153,101 @@ def test_a_convergence_over_samples_and_of_a_single_parameter(tmp_path):
     assert [row[0] for row in Page(markup).cells[title][1:]] == [
         "ptracer, independent, 4 spp", "reslrb:stack, independent, 4 spp"]  # fmt: skip
     assert LAMP in Page(markup).sections[title]
+
+
+def test_labels_name_their_samples_and_dldi_once():
+    """A label of `--spp` has the samples already, and a method may name its dL/dI."""
+    entries = [
+        {"label": name, "adjoint": adjoint, "spp": spp}
+        for name, adjoint, spp in (("prb, 4 spp", None, 4), ("prb", "batched", 4), ("prb, 16 spp", "batched", 16),
+                                   ("reslrb:stack(adjoint=batched), 4 spp", "batched", 4), ("x, 16 spp", None, 6))
+    ]  # fmt: skip
+    assert [*map(method_naming(entries), entries)] == [
+        "prb, 4 spp", "prb, batched, 4 spp", "prb, batched, 16 spp", "reslrb:stack(adjoint=batched), 4 spp",
+        "x, 16 spp, 6 spp"]  # fmt: skip
+    assert [*map(method_naming(entries[:2]), entries[:2])] == ["prb, 4 spp", "prb, batched"]
+
+
+def test_references_that_differ_are_marked(tmp_path):
+    lines = convergence_lines()
+    lines[4] |= {"biased": True, "bias_z": 9.0, "bias_reference": "prb"}
+    judged = {"bias_z": 7.5, "bias_z_limit": 4.5, "bias_reference": "ptracer"}
+    for biased, word, boxes in ((True, "DIFFERS from ptracer", 1), (False, "agrees with ptracer", 0)):
+        lines[-1] |= judged | {"biased": biased}
+        (tmp_path / "c").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        markup = render(read_sources([tmp_path / "c"]))
+        title = "Error against run time: c"
+        assert f"all: known to 0.01, 8 steps of reslrb:stack; {word}" in Page(markup).sections[title]
+        assert markup.count('class="note failed"') == boxes
+    assert Page(markup).row(title, "ptracer, independent biased")[3] == "9 > 4.5against prb"
+    assert [curve.name for curve in convergence_panels(lines)[0].curves] == [
+        "ptracer, independent (biased)", "reslrb:stack, independent"]  # fmt: skip
+
+
+def pretended_errors():
+    """Return lines of one method: three errors, the last one below the error of the reference, and one from too few
+    averages. The method needs 100 s for an error of 1 %, by extrapolation.
+    """
+    found = convergence_lines()[:5]
+    figures = [(0.5, 0.4, 8), (1.0, 0.2, 8), (2.0, 0.004, 8), (4.0, 0.1, 2)]
+    for line, (elapsed, error, repeats) in zip(found, figures, strict=False):
+        ends = {} if repeats < 4 else {"low": 0.9 * error, "high": 1.2 * error}
+        line |= {"elapsed_s": elapsed, "relative_rmse": error, "repeats": repeats, "reference_rmse": 0.01} | ends
+    found[4] |= {"seconds_to": {"0.1": 3.5, "0.03": 12.0, "0.01": 100.0}, "extrapolated": ["0.03", "0.01"]}
+    return found
+
+
+def test_hollow_points_and_extrapolations_of_a_convergence():
+    (panel,) = convergence_panels(pretended_errors())
+    (curve,) = panel.curves
+    assert panel.floor == 0.01
+    assert curve.filled().tolist() == [True, True, False, False]
+    assert curve.beyond == [(12.0, 0.03), (100.0, 0.01)]
+    assert [list(end[:3]) for end in curve.band] == [
+        pytest.approx([0.36, 0.18, 0.0036]),
+        pytest.approx([0.48, 0.24, 0.0048]),
+    ]
+    assert [end[3] for end in curve.band] == [None, None]
+    axis = Figure().subplots()
+    draw(axis, panel)
+    line, hollow, extrapolated, floor = axis.lines
+    assert line.get_markevery() == [True, True, False, False]
+    assert (hollow.get_fillstyle(), hollow.get_xdata().tolist()) == ("none", [2.0, 4.0])
+    # the dotted line begins at the last error that counts
+    assert extrapolated.get_linestyle() == ":"
+    assert extrapolated.get_xydata().tolist() == [[1.0, 0.2], [12.0, 0.03], [100.0, 0.01]]
+    assert (floor.get_linestyle(), floor.get_ydata()[0]) == ("-.", 0.01)
+    assert [axis.get_xscale(), axis.get_yscale(), len(axis.collections)] == ["log", "log", 1]
+
+
+def test_the_drawing_has_hollow_points_and_dotted_lines():
+    """The SVG has filled and hollow markers, and a dotted line in the colour of the method."""
+    found = []
+    for lines in (pretended_errors(), convergence_lines()[:5]):
+        drawing = diagram(convergence_panels(lines)[0])
+        markers = [
+            drawing.count(f'style="{fill}; stroke: {COLORS[0]}') for fill in ("fill-opacity: 0", f"fill: {COLORS[0]}")
+        ]
+        found.append((*markers, len(re.findall(rf"stroke-dasharray: [^>]*stroke: {COLORS[0]}", drawing))))
+    assert found == [(2, 2, 1), (0, 4, 1)]
+
+
+@pytest.mark.filterwarnings("ignore:.*tritanomaly")
+def test_colours_differ_for_all_eyes():
+    """The smallest difference (CIEDE2000) of two colours is 15 with red-green deficiencies, and 9 with the rare
+    tritanopia. Markers differ, too.
+    """
+    linear = colour.models.eotf_sRGB(np.array([to_rgb(color) for color in COLORS]))
+    seen = {None: linear} | {
+        kind: np.clip(linear @ colour.matrix_cvd_Machado2009(kind, 1.0).T, 0, 1)
+        for kind in ("Protanomaly", "Deuteranomaly", "Tritanomaly")
+    }
+    first, second = np.triu_indices(len(COLORS), 1)
+    for kind, colors in seen.items():
+        lab = colour.XYZ_to_Lab(colour.RGB_to_XYZ(colors, "sRGB"))
+        differences = colour.delta_E(lab[first], lab[second], method="CIE 2000")
+        assert differences.min() > (9 if kind == "Tritanomaly" else 15), kind
+    assert len(set(MARKERS)) == len(COLORS)
 
 
 def test_names_stay_text(tmp_path):
@@ -235,15 +335,6 @@ def test_damaged_lines_of_metrics_are_left_out(tmp_path, caplog):
         assert "cannot be shown" not in page.sections["Convergence"]
         said = f"{folder / 'metrics.jsonl'}: {count} line{'s' * (count > 1)} left out, because they are damaged"
         assert caplog.messages[-1] == said
-
-
-def write_sweep(folder):
-    """Write a sweep of two combinations, with one finished run of each."""
-    plan = SweepPlan("a.yaml", [], [Combination(f"spp={spp}", {"run.spp": spp}) for spp in (4, 8)], [0])
-    for combination in plan.combinations:
-        make_run(folder / run_name(combination, 0), results={"image_loss": {"initial": 1.0, "final": 0.5}})
-    plan.write(folder)
-    return folder
 
 
 def test_one_damaged_run_leaves_the_page_of_a_sweep(tmp_path):

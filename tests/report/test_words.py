@@ -9,7 +9,7 @@ import pytest
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import printable
-from reslrb_cli.report.format import count, interval, number, shorten, with_error
+from reslrb_cli.report.format import count, interval, number, rounded, shorten, with_error
 from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
 
 # Numbers, times, keys and results in words.
@@ -47,14 +47,41 @@ def test_times(seconds, text):
 def test_numbers():
     assert [count(amount, "iteration") for amount in (0, 1, 2)] == ["0 iterations", "1 iteration", "2 iterations"]
     assert (number(None), number(0.123456), number(1e6), number(0.5, 3)) == ("", "0.1235", "1e+06", "0.5")
-    assert interval(420, 150, 1200, 2) == "420 [150, 1200]"
-    assert interval(1.234, 0.5, 20, ".2f") == "1.23 [0.50, 20.00]"
     for size in 10.0 ** np.arange(-12, 12, 0.25):
         for digits in range(1, 6):
             for value in (size, -size):
                 text = number(value, digits)
                 assert float(text) == float(f"{value:.{digits}g}")
                 assert ("e+" in text) == (abs(float(text)) >= 1e6)
+
+
+@pytest.mark.parametrize(
+    ("figures", "text"),
+    [
+        ((424.2, 151.7, 1234.5), "420 [150, 1200]"),
+        ((0.58312, 0.5714, 0.5963), "0.583 [0.571, 0.596]"),  # half the width is 0.012: two digits
+        ((4.0123, 3.95, 4.08), "4.01 [3.95, 4.08]"),  # 0.065: one digit
+        ((1.234, 0.0031, 480.0), "1.2 [0.0031, 480]"),  # no end loses all its digits
+        ((-0.5, -0.55, -0.45), "-0.50 [-0.55, -0.45]"),
+        ((0.0, -0.2, 0.2), "0.00 [-0.20, 0.20]"),
+        ((2.34567e7, 2.2e7, 2.5e7), "2.35e+07 [2.20e+07, 2.50e+07]"),
+        ((3.2e-6, 3.1e-6, 3.4e-6), "3.20e-06 [3.10e-06, 3.40e-06]"),
+        ((5.0, 5.0, 5.0), "5 [5, 5]"),
+        ((2.5, 2.0, float("inf")), "2.5 [2, inf]"),
+    ],
+)
+def test_intervals_have_the_digits_that_they_support(figures, text):
+    assert interval(*figures) == text
+
+
+def test_intervals_keep_their_meaning():
+    """Rounding moves no number by more than a seventh of the interval's half width."""
+    random = np.random.default_rng(0)
+    for _ in range(2000):
+        value = random.choice([-1, 1]) * 10 ** random.uniform(-8, 8)
+        low, high = value - abs(value) * 10 ** random.uniform(-4, 1), value + abs(value) * 10 ** random.uniform(-4, 1)
+        for exact, text in zip((value, low, high), rounded(value, low, high), strict=True):
+            assert abs(float(text) - exact) <= (high - low) / 2 / 7
 
 
 def test_keys_are_shortened_in_the_middle():

@@ -10,7 +10,7 @@ import hashlib
 import io
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup, escape
 
 from reslrb_cli.config.files import duration
-from reslrb_cli.report.format import count, number
-from reslrb_cli.report.plots import COLORS, Curve, draw
+from reslrb_cli.report.format import count, number, rounded
+from reslrb_cli.report.plots import COLORS, Panel, draw
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -82,6 +82,7 @@ def _environment() -> Environment:
     )  # fmt: skip
     made.filters |= {
         "number": number,
+        "rounded": lambda figures: rounded(*figures),
         "duration": lambda seconds: "" if seconds is None else duration(seconds),
         "amount": count,
         "mib": lambda size: f"{number(size / 2**20)} MiB",
@@ -105,46 +106,33 @@ _CURVES = {
     "svg.fonttype": "none", "svg.hashsalt": "reslrb", "font.size": 10, "axes.linewidth": 0.6,
     "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
     "grid.color": _INK, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none",
+    "lines.linewidth": 1.5, "lines.markersize": 4, "text.parse_math": False,
 }  # fmt: skip
 
 
-def diagram(
-    curves: Sequence[Curve], caption: str, label: str, log_x: float | None = None, floors: Sequence[float] = ()
-) -> Markup:
-    """Return a diagram of curves with the x label `caption` and the y label `label`. The result is empty if no curve
-    has a point.
-
-    The y axis is logarithmic if positive values span a large factor. The x axis is logarithmic with base `log_x` if
-    `log_x` is given and all values are positive. `floors` are drawn as dotted horizontal lines. Labels must not contain
-    $, which Matplotlib takes for a formula.
-    """
+def diagram(panel: Panel) -> Markup:
+    """Return a diagram without its title. The result is empty if no curve has a point."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    known = [curve for curve in curves if len(curve.known())]
-    if not known:
+    if not panel.shown():
         return Markup()
     with matplotlib.rc_context(_CURVES):
         # Without pyplot, which would choose a backend for the whole process.
         figure = Figure(figsize=(WIDTH, HEIGHT))
         FigureCanvasSVG(figure)
         axis = figure.subplots()
-        draw(axis, known, log_x)
-        for floor in floors:
-            axis.axhline(floor, color=_INK, linewidth=1.0, linestyle=":")
-        axis.set_xlabel(caption)
-        axis.set_ylabel(label)
+        draw(axis, panel, _INK)
         axis.grid(True, which="both", axis="y", alpha=0.16, linewidth=0.6)
         axis.grid(True, axis="x", alpha=0.16, linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
         room = LABEL + LETTER * max(map(len, _labels(axis.yaxis)), default=0)
         figure.subplots_adjust(left=room / WIDTH, right=1 - LETTER / WIDTH, bottom=0.46 / HEIGHT, top=1 - 0.2 / HEIGHT)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     drawing = buffer.getvalue()
     drawing = drawing[drawing.index("<svg") :].replace(_INK, "currentColor")
-    about = escape(f"{label} against {caption}")
+    about = escape(f"{panel.y} against {panel.x}")
     return Markup(drawing.replace("<svg ", f'<svg role="img" aria-label="{about}" ', 1))
 
 

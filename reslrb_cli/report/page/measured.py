@@ -2,110 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 from markupsafe import Markup
 
-from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, SummaryRecord, Verdict, record_of
+from reslrb_cli.records.measurements import (
+    GradcheckRecord,
+    MethodRecord,
+    MissingRecord,
+    PointRecord,
+    ReferenceRecord,
+    SummaryRecord,
+    Verdict,
+    record_of,
+)
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.layout import diagram, key, lay_out
 from reslrb_cli.report.page.run import guarded, outcome, run_parts
 from reslrb_cli.report.page.sweep import sweep_parts
-from reslrb_cli.report.plots import Curve
+from reslrb_cli.report.panels import (
+    MOST_DRAWN,
+    SWEPT,
+    Entry,
+    bench_entries,
+    bench_panels,
+    convergence_panels,
+    label,
+    method_naming,
+    of_kind,
+    quantities,
+    quantity,
+)
 from reslrb_cli.report.sources import Measurements, ShownRun, Source, SweepRuns
-from reslrb_cli.report.tables import HEAD, cells, failure_line, summary_lines
-
-Entry = Mapping[str, Any]
-Naming = Callable[[Entry], str]
-
-#: Quantities that `bench` varies, by field name, in words.
-SWEPT = {"max_depth": "path depth", "spp": "samples per pixel"}
+from reslrb_cli.report.tables import HEAD, cells, failure_line, reference_line, summary_lines
 
 
 def bench(objects: Sequence[Entry]) -> Markup:
     """Return diagrams and a table of a bench."""
-    entries = [entry for entry in objects if "integrator" in entry and "status" in entry]
-    labels = list(dict.fromkeys(map(label, entries)))
-    name = next((name for name in SWEPT if len({entry.get(name) for entry in entries}) > 1), "max_depth")
-    drawn = [
-        ("", diagram(curves_of(entries, labels, label, name, what), SWEPT[name], words, log_x=2))
-        for what, words in (("step_ms", "time of a step (ms)"), ("peak_mib", "peak memory (MiB)"))
-    ]
+    entries, name = bench_entries(objects)
+    panels = bench_panels(objects)
     entries.sort(key=lambda entry: entry.get(name) or 0)
     fixed = [f"{SWEPT[other]} {number(entries[0].get(other))}" for other in SWEPT if other != name and entries]
     rows = [{"label": label(entry), "entry": entry} for entry in entries]
-    parts = lay_out("legend", labels) + lay_out("diagrams", drawn)
+    parts = lay_out("legend", [curve.name for curve in panels[0].curves])
+    parts += lay_out("diagrams", [("", diagram(panel)) for panel in panels])
     return parts + lay_out("measured.bench", rows, name, SWEPT[name], fixed)
 
 
-def label(entry: Entry) -> str:
-    """Return an integrator's name as the user wrote it. Records of older versions lack it: return the integrator, the
-    estimator, and the capacity if it differs from the default.
-    """
-    if entry.get("label"):
-        return str(entry["label"])
-    parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
-    return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
-
-
-def curves_of(entries: Sequence[Entry], labels: Sequence[str], naming: Naming, x: str, y: str) -> list[Curve]:
-    """Return a curve of `y` over `x` for each label. For spreads, the curve shows medians with a band."""
-    curves = []
-    for place, name in enumerate(labels):
-        rows = sorted((row for row in entries if naming(row) == name and row.get(x)), key=lambda row: float(row[x]))
-        figures = [row.get(y) for row in rows]
-        spreads = [value for value in figures if isinstance(value, Mapping)]
-        if spreads:
-            rows = [row for row in rows if isinstance(row.get(y), Mapping)]
-            low, figures, high = ([value[end] for value in spreads] for end in ("min", "median", "max"))
-        xs, band = [row[x] for row in rows], (low, high) if spreads else None
-        curves.append(Curve(name, xs, figures, place, band, points=True))
-    return curves
-
-
-#: Maximum number of drawn quantities: all parameters together, the image, then single parameters.
-MOST_DRAWN = 8
-
-
 def convergence(objects: Sequence[Entry]) -> Markup:
-    """Return the summary of a convergence, a diagram for each quantity, and a table of the methods."""
-    points, methods = ([entry for entry in objects if entry.get("kind") == kind] for kind in ("point", "method"))
-    spps = len({entry.get("spp") for entry in [*points, *methods] if entry.get("status", "ok") == "ok"})
-    name = partial(method_label, with_spp=spps > 1)
-    said = [lay_out("paragraph", entry["line"]) for entry in objects if entry.get("kind") == SummaryRecord.KIND]
-    labels = list(dict.fromkeys(map(name, [*methods, *points])))
-    quantities = list(dict.fromkeys(map(quantity, [*points, *methods])))
-    quantities.sort(key=lambda what: {"all": 0, "image": 1}.get(what, 2))
-    drawn = [_error_diagram([entry for entry in points if quantity(entry) == what], labels, what, name)
-             for what in quantities[:MOST_DRAWN]]  # fmt: skip
+    """Return the summary of a convergence, a diagram for each quantity, the references, and a table of the methods."""
+    points, methods = of_kind(objects, PointRecord), of_kind(objects, MethodRecord)
+    said = [lay_out("paragraph", entry["line"]) for entry in of_kind(objects, SummaryRecord)]
+    lines = of_kind(objects, ReferenceRecord)
+    references = [found for line in lines if (found := record_of(ReferenceRecord, line)) is not None]
+    differing = [reference_line(record) for record in references if record.biased]
+    agreeing = [reference_line(record) for record in references if not record.biased]
+    name, shown = method_naming([*methods, *points]), quantities([*points, *methods])
+    panels = convergence_panels(objects)
+    titles = {title for panel in panels if (title := panel.title) not in shown}  # words, which are no keys
+    drawn = [(panel.title if panel.title in titles else key(panel.title), diagram(panel)) for panel in panels]
     rows = [
-        {"name": name(entry), "of": what, "place": quantities.index(what), "entry": entry}
+        {"name": name(entry), "of": quantity(entry), "place": shown.index(quantity(entry)), "entry": entry}
         for entry in methods
-        if (what := quantity(entry)) in quantities
     ]
-    return Markup().join(said) + lay_out("legend", labels) + lay_out("diagrams", drawn) + lay_out(
-        "measured.methods", rows, bool(points), len(quantities), MOST_DRAWN)  # fmt: skip
-
-
-def quantity(entry: Entry) -> str:
-    """Return the quantity of an error: a parameter key, `all` or `image`."""
-    return str(entry.get("parameter") or "all")
-
-
-def method_label(entry: Entry, with_spp: bool = False) -> str:
-    """Return a method's name, and its sampling if known."""
-    parts = [label(entry), str(entry.get("adjoint") or "")]
-    parts += [f"{entry['spp']} spp"] if with_spp and entry.get("spp") else []
-    return ", ".join(part for part in parts if part)
-
-
-def _error_diagram(points: Sequence[Entry], labels: Sequence[str], what: str, naming: Naming) -> tuple[str, Markup]:
-    floors = sorted(value for entry in points if (value := entry.get("reference_rmse") or 0) > 0)
-    curves = curves_of(points, labels, naming, "elapsed_s", "relative_rmse")
-    drawing = diagram(curves, "time (s)", "relative error", 10, floors[len(floors) // 2 :][:1])
-    return {"all": "all parameters", "image": "the image"}.get(what, key(what)), drawing
+    parts = Markup().join(said) + lay_out("note", differing, "failed")
+    parts += lay_out("legend", [curve.name for curve in panels[0].curves] if panels else [])
+    parts += lay_out("diagrams", drawn) + Markup().join(lay_out("soft", line) for line in agreeing)
+    return parts + lay_out("measured.methods", rows, bool(points), len(shown), MOST_DRAWN)
 
 
 #: Maximum number of names in the title of a page.

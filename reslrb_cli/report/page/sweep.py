@@ -30,11 +30,12 @@ from reslrb_cli.records.sweeps import (
     run_name,
     short_keys,
 )
-from reslrb_cli.report.format import count, number, shorten, table
+from reslrb_cli.report.format import count, interval, number, shorten, table
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, lay_out, soft
 from reslrb_cli.report.page.run import guarded
-from reslrb_cli.report.plots import COLORS, MOST_POINTS, Curve
+from reslrb_cli.report.panels import run_panels
+from reslrb_cli.report.plots import COLORS
 from reslrb_cli.report.run_summary import total_error, units_differ
 from reslrb_cli.report.sources import ShownRun, SweepRuns
 from reslrb_cli.report.tonemap import exposure_words, shown_exposures
@@ -258,9 +259,11 @@ def _cell(name: str, band: Band | None) -> str:
     """Return a median as text. The ends of its band follow if they differ."""
     if band is None:
         return ""
-    write = {"elapsed_s": duration, "peak_mib": lambda size: f"{number(size)} MiB"}.get(name, lambda v: number(v, 4))
-    ends = "" if band.low == band.high else f" [{write(band.low)}, {write(band.high)}]"
-    return write(band.median) + ends
+    if band.low == band.high or name == "elapsed_s":
+        write = {"elapsed_s": duration, "peak_mib": lambda size: f"{number(size)} MiB"}.get(name, number)
+        ends = "" if band.low == band.high else f" [{write(band.low)}, {write(band.high)}]"
+        return write(band.median) + ends
+    return interval(band.median, band.low, band.high) + (" MiB" if name == "peak_mib" else "")
 
 
 # --- the page ---------------------------------------------------------------------------------------------------------
@@ -306,7 +309,7 @@ def sweep_parts(source: SweepRuns) -> dict[str, Markup]:
 
 def _curves(source: SweepRuns, drawn: Sequence[Combination]) -> Markup:
     """Return the diagrams of the first combinations."""
-    own = [_runs(source, combination) for combination in drawn]
+    own = [runs_of(source, combination) for combination in drawn]
     more = len(source.sweep.combinations) - len(drawn)
     line = soft(f"{more} more combinations are not drawn." if more else "")
     parts = curves([label(each.settings) for each in drawn], own)
@@ -319,59 +322,17 @@ def curves(titles: Sequence[str], own: Sequence[Sequence[ShownRun]]) -> Markup:
     """
     if not any(own):
         return Markup()
+    panels = iter(run_panels(titles, own))
     parts = lay_out("legend", [title if runs else "" for title, runs in zip(titles, own, strict=True)])
-    kinds = {"loss": "loss"}
-    if not any(units_differ(run.results) for runs in own for run in runs):
-        kinds["parameter_rmse"] = "parameter RMSE"
-    for name, title in kinds.items():
-        both = []
-        for against, caption in ((_by_iteration, "iteration"), (_by_time, "time in steps and updates (s)")):
-            drawn = [_median(each, place, *against(runs, name))
-                     for place, (each, runs) in enumerate(zip(titles, own, strict=True)) if runs]  # fmt: skip
-            both.append(("", diagram(drawn, caption, title)))
-        parts += lay_out("diagrams", both)
+    for pair in zip(panels, panels, strict=True):
+        parts += lay_out("diagrams", [("", diagram(panel)) for panel in pair])
     return parts
 
 
-def _runs(source: SweepRuns, combination: Combination) -> list[ShownRun]:
+def runs_of(source: SweepRuns, combination: Combination) -> list[ShownRun]:
     """Return the runs of a combination that have at least one iteration."""
     names = [run_name(combination, seed) for seed in source.sweep.seeds]
     return [run for name in names if (run := source.runs.get(name)) is not None and run.records]
-
-
-def _by_iteration(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
-    """Return the iterations (N,) and the values of each run (runs, N), NaN where unknown."""
-    most = max(len(run.records) for run in runs)
-    values = np.full((len(runs), most), np.nan)
-    for row, run in zip(values, runs, strict=True):
-        row[: len(run.records)] = run.column(name)
-    return np.arange(most), values
-
-
-def _by_time(runs: Sequence[ShownRun], name: str) -> tuple[Array, Array]:
-    """Return times in seconds (N,), and for each run its latest value at each time (runs, N).
-
-    The first time is the earliest one at which all runs have completed an iteration. A run that has ended keeps its
-    last value.
-    """
-    ends = [np.array(run.column("elapsed_s"), dtype=np.float64) for run in runs]
-    times = np.unique(np.concatenate(ends))
-    times = times[times >= max(end[0] for end in ends)]
-    times = times[:: -(-len(times) // MOST_POINTS)]
-    values = np.full((len(runs), len(times)), np.nan)
-    for row, run, end in zip(values, runs, ends, strict=True):
-        row[:] = np.array(run.column(name), dtype=np.float64)[np.searchsorted(end, times, side="right") - 1]
-    return times, values
-
-
-def _median(title: str, place: int, xs: Array, values: Array) -> Curve:
-    """Return the curve of medians at the places where all runs have a value. The band shows minimum and maximum."""
-    known = np.isfinite(values).all(axis=0)
-    xs, values = xs[known], values[:, known]
-    if not len(xs):
-        return Curve(title, [], [], place)
-    band = (values.min(axis=0), values.max(axis=0)) if len(values) > 1 else None
-    return Curve(title, xs.tolist(), np.median(values, axis=0).tolist(), place, band)
 
 
 def _images(source: SweepRuns) -> Markup:
@@ -380,7 +341,7 @@ def _images(source: SweepRuns) -> Markup:
     """
     shown = []
     for combination in source.sweep.combinations:
-        done = [run for run in _runs(source, combination) if run.manifest.get("status") == Status.FINISHED]
+        done = [run for run in runs_of(source, combination) if run.manifest.get("status") == Status.FINISHED]
         shown += [(combination, done[0])] if done else []
     if not shown:
         return Markup()

@@ -12,7 +12,8 @@ from reslrb_cli.records.images import finite_range, in_range, read_mask, read_pa
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
-from reslrb_cli.report.plots import COLORS, Curve, points_together
+from reslrb_cli.report.panels import ITERATION, TIME
+from reslrb_cli.report.plots import COLORS, Curve, Panel, points_together
 from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
 from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
@@ -132,7 +133,7 @@ def _swatches(key: str, about: Mapping[str, Any]) -> dict[str, str]:
 #: Maximum number of curves in a diagram of one run, for the parameters with the largest final errors.
 MOST_CURVES = len(COLORS)
 
-ABSCISSAE = (("iteration", "iteration"), ("elapsed_s", "time in steps and updates (s)"))
+ABSCISSAE = (("iteration", ITERATION), ("elapsed_s", TIME))
 Figures = list[float | None]
 
 
@@ -170,16 +171,16 @@ def _losses(run: ShownRun) -> Markup:
     for name, caption in ABSCISSAE:
         xs = run.column(name)
         iterations = Curve("iterations", xs, run.column("loss"), 0)
-        drawn.append(("", diagram([iterations, Curve("saved images", [xs[0], xs[-1]], ends, 1, points=True)],
-                                  caption, "loss")))  # fmt: skip
+        curves = [iterations, Curve("saved images", [xs[0], xs[-1]], ends, 1, points=True)]
+        drawn.append(("", diagram(Panel("", caption, "loss", curves))))
     return lay_out("diagrams", drawn) + lay_out("legend", ["iterations", "saved images, with less noise"])
 
 
 def _both(run: ShownRun, label: str, curves: Mapping[str, Figures]) -> Markup:
     """Return the same curves in two diagrams side by side, over iterations and over time."""
     drawn = [
-        ("", diagram([Curve(title, run.column(name), ys, k) for k, (title, ys) in enumerate(curves.items())],
-                     caption, label))
+        ("", diagram(Panel("", caption, label, [
+            Curve(title, run.column(name), ys, k) for k, (title, ys) in enumerate(curves.items())])))
         for name, caption in ABSCISSAE
     ]  # fmt: skip
     return lay_out("diagrams", drawn)
