@@ -122,6 +122,8 @@ def _run(plan: ConvergencePlan, options: ConvergenceOptions, began: float) -> tu
                     echo(table.line(method_cells(judgement.overall(member), f"{rounds} rounds")))
         keeper.finish(interrupts.requested)
         results = Judgement(session).results()
+        if table is None and session.facts:
+            echo(_conditions(plan, session))
         table = _table(session)
         echo(table.head())
         for record in results.methods:
