@@ -288,7 +288,11 @@ def test_convergence_writes_the_records_of_the_command(folder: Path, monkeypatch
     monkeypatch.setattr(session, "Session", Played)
     given = ["--integrators", "reslrb:stack,ptracer", "--reference", "reslrb:stack", "--rounds", "8", "--spp", "4,8"]
     done("convergence", "tiny.yaml", *given, "--json", "c.jsonl")
+    assert (
+        ", dL/dI fixed" in done("convergence", "tiny.yaml", "--rounds", "3").stdout
+    )  # without a line while it measures
     records = rl.convergence("tiny.yaml", "reslrb:stack,ptracer", rounds=8, spps=[4, 8], reference="reslrb:stack")
+    assert records.draws["ptracer, 4 spp"].values.shape == records.draws["ptracer, 8 spp"].values.shape == (16, 63)
     found = [json.loads(record.to_json()) for record in records]
     assert found == measured("c.jsonl")
     assert {"point", "method", "reference", "summary"} <= {each["kind"] for each in found}
