@@ -8,6 +8,7 @@ if this is not known.
 from __future__ import annotations
 
 import ast
+import functools
 import json
 import os
 import re
@@ -28,10 +29,23 @@ RECORDS = ROOT / "docs" / "benchmarks"
 PAPER = ROOT / "docs" / "paper"
 #: The page of the extreme suite. Its record only counts the comparisons, which are thousands.
 EXTREME = ROOT / "docs" / "extreme.md"
-#: The code that every figure depends on, and the code that the figures of a command depend on besides.
-CODE = tuple(f"reslrb_cli/{name}" for name in ("backend", "scene", "transport", "estimators", "guiding", "integrators"))
+#: The code that every figure depends on: sampling, the defaults of the settings, seeds, and the timer.
+CODE = tuple(
+    f"reslrb_cli/{name}" for name in (
+        "backend", "scene", "transport", "estimators", "guiding", "integrators", "config", "optimization",
+        "colorimetry.py", "glasses.py", "lens/transport.py", "seeds.py", "statistics.py", "records/clock.py",
+        "records/decisions.py", "records/images.py",
+    )
+)  # fmt: skip
+#: The code that the figures of a command depend on besides.
 MEASURE = ("reslrb_cli/measure",)
-MEASURED_BY = {"optimize": ("reslrb_cli/optimization",), "figure1": (*MEASURE, "configs/paper/figure1.yaml")}
+PAPERS = (*MEASURE, "paper", "reslrb_cli/report/tonemap.py")
+MEASURED_BY = {
+    "optimize": (),
+    "figure1": (*PAPERS, "configs/paper/figure1.yaml"),
+    "figure5": PAPERS,
+    "figure6": PAPERS,
+}
 #: Changes of these change no figure.
 WRITTEN = (":!docs", ":!README.md", ":!CHANGELOG.md")
 #: The experiments in configs/ in the order of the README's table, and its words for them.
@@ -177,7 +191,15 @@ def _syntax(text: str) -> str:
     for node in ast.walk(tree):
         if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
             del node.body[0]
-    return ast.dump(_WithoutMessages().visit(tree))
+    return ast.dump(_WithoutMessages(_seeding(ROOT)).visit(tree))
+
+
+@functools.cache
+def _seeding(root: Path) -> frozenset[str]:
+    """Return the functions whose arguments contain the purpose of a seed. A seed depends on this text."""
+    texts = (file.read_text(encoding="utf-8") for file in (root / "reslrb_cli").rglob("*.py"))
+    found = (re.findall(r"def (\w+)\([^()]*\bpurpose: str", text) for text in texts)
+    return frozenset({"seed", "_seed"}.union(*found))
 
 
 #: A word of a message.
@@ -186,8 +208,23 @@ _WORD = re.compile(r"[a-z]{2,}", re.IGNORECASE)
 
 class _WithoutMessages(ast.NodeTransformer):
     """Transformer that replaces all messages of a syntax tree by the same text, and leaves out the statements that
-    prepare an error: those before a `raise` in the same branch of an `if`.
+    prepare an error: those before a `raise` in the same branch of an `if`. Purposes of seeds are no messages: the
+    arguments of the functions `seeding`, and values of variables whose names contain `purpose`.
     """
+
+    def __init__(self, seeding: frozenset[str]) -> None:
+        self._seeding = seeding
+
+    def visit_Call(self, node: ast.Call) -> ast.Call:
+        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        if name not in self._seeding:
+            self.generic_visit(node)
+        return node
+
+    def visit_Assign(self, node: ast.Assign) -> ast.Assign:
+        if not any("purpose" in getattr(target, "id", "").lower() for target in node.targets):
+            self.generic_visit(node)
+        return node
 
     def visit_If(self, node: ast.If) -> ast.If:
         self.generic_visit(node)

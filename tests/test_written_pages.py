@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,8 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
 ) -> None:
     for name, content in {
         "configs/room.yaml": "scene: {file: ../scenes/room/scene.xml}\nrun: {spp: 1}", "scenes/room/scene.xml": "",
-        "docs/a.md": "", "reslrb_cli/measure/bench.py": "", "reslrb_cli/cli/bench.py": "",
+        "docs/a.md": "", "reslrb_cli/config/run.py": "", "reslrb_cli/records/clock.py": "",
+        "reslrb_cli/measure/bench.py": "", "reslrb_cli/cli/bench.py": "",
         "reslrb_cli/transport/walk.py": 'a = f"must be less than {1}"\nif a:\n    b = 1\n    raise ValueError(b)',
     }.items():  # fmt: skip
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +122,8 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
     for place, names in {
         "reslrb_cli/measure/bench.py": ["depth"], "configs/room.yaml": ["depth", "room"],
         "scenes/room/scene.xml": ["depth", "room"],
-        "reslrb_cli/transport/walk.py": ["depth", "room"],
+        "reslrb_cli/transport/walk.py": ["depth", "room"], "reslrb_cli/config/run.py": ["depth", "room"],
+        "reslrb_cli/records/clock.py": ["depth", "room"],
     }.items():  # fmt: skip
         capsys.readouterr()
         (tmp_path / place).write_text("scene: {file: ../scenes/room/scene.xml}" if place.endswith(".yaml") else "a = 1")
@@ -130,11 +133,50 @@ def test_a_record_is_stale_after_a_change_of_the_measured_code(
         assert [line.split(":")[0] for line in lines] == names
     assert lines[1] == (
         f"room: measured at {state['commit']}; files changed since then: reslrb_cli/transport (1), "
-        "configs/room.yaml (1), scenes/room (1)"
+        "reslrb_cli/config (1), reslrb_cli/records/clock.py (1), configs/room.yaml (1), scenes/room (1)"
     )
     record = tmp_path / "docs" / "benchmarks" / "room.jsonl"
     record.write_text(json.dumps({"kind": "origin", "command": commands["room"], "commit": "0" * 12}) + "\n")
     assert benchmarks_measure.stale()[1] == "room: the commit that it was measured at is not known"
+
+
+def test_texts_that_seeds_depend_on_are_no_messages() -> None:
+    def same(text: str) -> bool:
+        return benchmarks_measure._syntax(text.format("first one")) == benchmarks_measure._syntax(
+            text.format("second one")
+        )
+
+    assert same("say('{}')")
+    assert same("a = f'{} {{a}}'")
+    for text in ("seed(0, 1, 2, '{}')", "self._seed(round, view, f'{}, {{name}}')", "see_images(problem, 1, 0, '{}')",
+                 "problem.render(0, 16, 1, '{}')", "purposes = ['{}']", "_PURPOSE = '{}'"):  # fmt: skip
+        assert not same(text), text
+
+
+#: Modules that measured code imports, but no figure depends on: errors, text, and files of results.
+NO_FIGURE = {f"reslrb_cli/{name}.py" for name in ("__init__", "errors", "version", "report/format")} | {
+    f"reslrb_cli/records/{name}.py" for name in (
+        "__init__", "atomic", "checkpoint", "lock", "manifest", "measurements", "measurement_files", "metrics",
+        "run_folder", "tree",
+    )
+}  # fmt: skip
+
+
+def test_figures_depend_on_all_modules_that_measured_code_imports() -> None:
+    @cache
+    def imports(file: Path) -> set[str]:
+        """Return the modules of the package that a file imports, as paths."""
+        found = re.findall(r"^ *from (reslrb_cli[\w.]*) import (\([^)]*\)|.*)", file.read_text(encoding="utf-8"), re.M)
+        return {
+            place for module, names in found for name in ["", *re.findall(r"\w+", names)]
+            if (ROOT / (place := f"{module}.{name}".strip(".").replace(".", "/") + ".py")).is_file()
+        }  # fmt: skip
+
+    for command in ("bench", "gradcheck", "optimize", "figure5"):
+        places = [ROOT / place for place in benchmarks_measure.measures(["reslrb", command])]
+        files = {file for place in places for file in ([place] if place.is_file() else place.rglob("*.py"))}
+        imported = set().union(*(imports(file) for file in files if file.suffix == ".py"))
+        assert imported - {str(file.relative_to(ROOT)) for file in files} - NO_FIGURE == set(), command
 
 
 def test_no_figure_is_typed_by_hand() -> None:
