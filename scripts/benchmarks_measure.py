@@ -278,9 +278,7 @@ def measure(name: str, words: Sequence[str]) -> None:
         lines[0] |= {"command": ["reslrb", *words], "seconds": seconds} | tree
         if name == "extreme":  # the page has the thousands of comparisons
             EXTREME.write_text(extreme_page(lines), encoding="utf-8")
-            holds = [line["holds"] for line in lines if "verdict" in line]
-            counts = {"comparisons": len(holds), "hold": holds.count(True), "fail": holds.count(False)}
-            lines = [lines[0], {"kind": "suite"} | counts]
+            lines = [lines[0], *suite_summary(lines)]
         record_file(name).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
         if name == "depth":
             draw(record_file(name), ROOT / "docs" / "images" / "bench.png")
@@ -301,6 +299,31 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"|{line}|" for line in lines)
 
 
+def suite_summary(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the lines of the record of a suite: the counts, and the open comparisons by parameter and reason."""
+    from reslrb_cli.records.measurements import GradcheckRecord, record_of
+    from reslrb_cli.report.tables import open_reasons
+
+    records = [record for line in lines if (record := record_of(GradcheckRecord, line)) is not None]
+    holds = [record.holds for record in records]
+    counts = {"cases": len({record.case for record in records}), "comparisons": len(holds), "hold": holds.count(True),
+              "fail": holds.count(False)}  # fmt: skip
+    return [{"kind": "suite"} | counts] + [
+        {"kind": "open", "parameter": parameter, "reason": reason,
+         "cases": list(dict.fromkeys(record.case for record in group))}
+        for (parameter, reason), group in open_reasons(records).items()
+    ]  # fmt: skip
+
+
+def open_comparisons(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a text for each reason why comparisons of a suite stay open, from the lines of `suite_summary`."""
+    return [
+        f"{row['parameter'].removesuffix('.value').removesuffix('.data')} in "
+        f"{', '.join(f'`{case}`' for case in row['cases'])} ({row['reason']})"
+        for row in rows if row["kind"] == "open"
+    ]  # fmt: skip
+
+
 def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the page of the extreme suite, made from the lines of its file. The page has a row for each case and a
     column for each estimator.
@@ -319,6 +342,7 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         cells = [_suite_cell([record for record in own if record["estimator"] == name]) for name in estimators]
         named = ", ".join(references).replace("finite_difference", "differences")
         rows.append([f"`{case}`", CASES[case].about, named, str(own[0]["seeds"]), *cells])
+    opened = "".join(f"- {text}\n" for text in open_comparisons(suite_summary(lines))) or "None.\n"
     return (
         "# The extreme suite\n\n"
         "Scenes in which gradients of light paths often fail, each with its own reference. This command measures\n"
@@ -326,10 +350,11 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         "    scripts/benchmarks measure extreme\n\n"
         f"The figures are from {origin['device']}, {origin['variant']}.\n\n"
         "The columns of the estimators contain two figures. The first is the largest deviation in standard errors\n"
-        f"over many seeds (limit {z:.1f}). The second is the largest relative L2 distance at equal seeds\n"
+        f"over many seeds (limit at most {z:.1f}). The second is the largest relative L2 distance at equal seeds\n"
         f"(limit {distance:.0e}). Comparisons that fail or stay open are in bold.\n"
         "[Check gradients](gradcheck.md) explains references and verdicts.\n\n"
-        f"{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
+        f"## Open comparisons\n\n{opened}\n"
+        f"## Cases\n\n{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
     )
 
 

@@ -22,7 +22,6 @@ from typing import Any
 from benchmarks_measure import (
     CHECKED,
     EXPERIMENTS,
-    EXTREME,
     MEASUREMENTS,
     OTHERS,
     RECORDS,
@@ -30,6 +29,7 @@ from benchmarks_measure import (
     experiment_record,
     gallery_picture,
     measure,
+    open_comparisons,
     read_lines,
     stale,
     table,
@@ -264,17 +264,16 @@ class Blocks:
         return _with_commits(table(head, rows), found)
 
     def extreme(self) -> str:
-        """Return the result of the extreme suite, from its page and, if it exists, from its record."""
-        scenes = EXTREME.read_text(encoding="utf-8").count("\n| `")
-        found, origin = "none fails", {}
-        if (self.folder / "extreme.jsonl").exists():
-            record = self.record("extreme")
-            counts, origin = record.rows[0], record.origin
-            found = f"{counts['hold']} of {counts['comparisons']} comparisons hold, {counts['fail']} fail"
+        """Return the result of the extreme suite: its counts, and what stays open."""
+        record = self.record("extreme")
+        counts = record.rows[0]
+        left = counts["comparisons"] - counts["hold"] - counts["fail"]
+        opened = f", {left} stay open: {'; '.join(open_comparisons(record.rows))}" if left else ""
         return _filled(
             "`reslrb gradcheck --suite extreme` compares the gradients of every estimator with references in "
-            f"{scenes} difficult scenes: {found} ([The extreme suite](docs/extreme.md)). "
-            f"Measured at {commit_of(origin)}."
+            f"{counts['cases']} difficult scenes ([The extreme suite](docs/extreme.md)): {counts['hold']} of "
+            f"{counts['comparisons']} comparisons hold, {counts['fail']} fail{opened}. "
+            f"Measured at {commit_of(record.origin)}."
         )
 
     def experiments(self) -> str:

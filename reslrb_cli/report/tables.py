@@ -128,14 +128,22 @@ def summary_lines(records: Sequence[GradcheckRecord]) -> list[str]:
     if count[Verdict.NOT_MEASURED]:
         message = next(record.message for record in open_ if record.verdict is Verdict.NOT_MEASURED)
         lines.append(f"open: {count[Verdict.NOT_MEASURED]} not measured: {message}")
-    reasons: dict[tuple[str, str], list[GradcheckRecord]] = {}
-    for record in (record for record in open_ if record.verdict is not Verdict.NOT_MEASURED):
-        reasons.setdefault((parameter_name(record), record.message), []).append(record)
-    for (what, message), group in reasons.items():
+    for (what, message), group in open_reasons(open_).items():
         pairs = dict.fromkeys(f"{integrator_name(r)} against {reference_name(r)}" for r in group)
         which = "" if group[0].verdict is Verdict.NO_REFERENCE else f"{', '.join(pairs)}: "
-        lines.append(f"open: {what}: {which}{message}")
+        cases = dict.fromkeys(record.case for record in group)
+        where = f" in {', '.join(cases)}" if len({record.case for record in records}) > 1 else ""
+        lines.append(f"open{where}: {what}: {which}{message}")
     return lines + [f"FAILS: {failure_line(record)}" for record in records if record.verdict is Verdict.FAILS]
+
+
+def open_reasons(records: Iterable[GradcheckRecord]) -> dict[tuple[str, str], list[GradcheckRecord]]:
+    """Return the open comparisons of `records` by parameter and reason, without those that were not measured."""
+    found: dict[tuple[str, str], list[GradcheckRecord]] = {}
+    for record in records:
+        if record.holds is None and record.verdict is not Verdict.NOT_MEASURED:
+            found.setdefault((parameter_name(record), record.message), []).append(record)
+    return found
 
 
 def gradcheck_columns(records: Iterable[GradcheckRecord]) -> Columns:

@@ -133,6 +133,24 @@ def test_a_stopped_suite_keeps_finished_cases(tmp_path: Path, monkeypatch: pytes
     assert [row["case"] for row in measured(file)] == ["first"] * 2
 
 
+def test_a_suite_names_its_open_cases(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from reslrb_cli.measure import extreme
+
+    def pretended(name: str, *_others: object) -> Iterator[GradcheckRecord]:
+        row = {"case": name, "parameter": "a.value", "integrator": "reslrb", "estimator": "stack", "seeds": 8}
+        row |= {"reference": Reference.PRB, "kind": Kind.EXPECTATION}
+        yield GradcheckRecord(**row, verdict=Verdict.HOLDS)
+        if name != "held":
+            yield GradcheckRecord(**row, verdict=Verdict.UNRESOLVED, message="is noisy")
+
+    monkeypatch.setattr(extreme, "run_case", pretended)
+    monkeypatch.setattr(extreme, "CASES", {name: name for name in ("held", "first", "second")})
+    assert call("--suite", "extreme") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2] == "3 of 5 comparisons hold, 0 fail, 2 leave the question open"
+    assert lines[-1] == "open in first, second: a.value: reslrb:stack against prb: is noisy"
+
+
 def test_ctrl_c_prints_finished_comparisons(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

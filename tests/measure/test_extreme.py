@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -13,10 +14,11 @@ import pytest
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
 from reslrb_cli.integrators.protocol import Job
-from reslrb_cli.measure.extreme import CASES, LISTED
-from reslrb_cli.measure.extreme.suite import WAYS, run_case
+from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, divisions, overall, parts
+from reslrb_cli.measure.extreme import CASES, LISTED, suite
+from reslrb_cli.measure.extreme.suite import MOST_CASES, WAYS, run_case
 from reslrb_cli.measure.gradients import integrator
-from reslrb_cli.records.measurements import GradcheckRecord, Verdict
+from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Verdict
 
 #: The case of the default suite: a lamp of which no point can be drawn. test_replay.py has values that are not finite,
 #: and test_plan.py scenes without a connection. Tests of roulette with its fault, and of a furnace, stand below.
@@ -29,15 +31,45 @@ def failures(records: Iterable[GradcheckRecord]) -> list[str]:
 
 
 def test_names():
-    assert len(CASES) >= 40
+    assert 40 <= len(CASES) <= MOST_CASES
     assert len(CASES) == len(LISTED), "no two have the same"
 
 
-@pytest.mark.parametrize(("name", "estimator"), [(name, "stack") for name in FEW])
-def test_case(name: str, estimator: str):
-    records = list(run_case(CASES[name], [estimator]))
-    assert {record.estimator for record in records} == {estimator}
+def counted(monkeypatch: pytest.MonkeyPatch, name: str, estimators: Iterable[str] | None) -> list[GradcheckRecord]:
+    """Run a case. Assert that its correction counts all comparisons by z scores, and their entries."""
+    made: list[tuple[Family, int]] = []
+
+    def compare(ours: np.ndarray, reference: np.ndarray, family: Family, **options: Any) -> Comparison:
+        shape = options.get("shape")
+        sizes = ours.shape[1] if shape is None else parts(ours, shape, divisions(shape)[0]).shape[1]
+        made.append((family, sizes if shape is None else sizes + overall(ours).shape[1]))
+        return compare_expectations(ours, reference, family, **options)
+
+    monkeypatch.setattr(suite, "compare_expectations", compare)
+    records = list(run_case(CASES[name], estimators))
+    [family] = {family for family, _ in made}
+    assert family == Family(len(made), sum(entries for _, entries in made), ALPHA / MOST_CASES)
     assert not failures(records)
+    return records
+
+
+@pytest.mark.parametrize(("name", "estimator"), [(name, "stack") for name in FEW])
+def test_case(monkeypatch: pytest.MonkeyPatch, name: str, estimator: str):
+    records = counted(monkeypatch, name, [estimator])
+    assert {record.estimator for record in records} == {estimator}
+
+
+def test_images_with_heavy_tails_are_open_only_for_a_reason():
+    """One seed has a firefly, and the other noise hides no deviation."""
+    random, case, family = np.random.default_rng(1), CASES["furnace"], Family(10, 1000)
+    ours, stock = (1 + 0.01 * random.normal(size=(16, 8, 8, 3)) for _ in range(2))
+    assert suite._images(case, ours, stock, family).verdict is Verdict.HOLDS
+    ours[3] += 50
+    found = suite._images(case, ours, stock, family)
+    assert (found.verdict, found.message[:13]) == (Verdict.FAILS, "heavy_tailed:")
+    known = replace(case, open_ended={suite.IMAGE: "a reason"})
+    found = suite._images(known, ours, stock, family)
+    assert (found.verdict, found.message) == (Verdict.HEAVY_TAILED, "a reason")
 
 
 @pytest.mark.parametrize(
@@ -71,8 +103,8 @@ def test_moving_cases_use_only_light_paths():
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
-def test_every_case(name: str):
-    assert not failures(run_case(CASES[name]))
+def test_every_case(monkeypatch: pytest.MonkeyPatch, name: str):
+    counted(monkeypatch, name, None)
 
 
 def lost(case: str, estimator: str) -> list[str]:

@@ -106,12 +106,12 @@ GLASS_CASES = [
                 options={"max_depth": 8}),
     ExtremeCase("critical_angle", "a beam that is totally reflected at the critical angle", critical,
                 ("surface.bsdf.specular_reflectance.value", "floor.bsdf.reflectance.value"), Stock("ptracer"),
-                image="ptracer", spp=512),
+                image="ptracer", spp=512, seeds=8),
     exact("refraction", "a point light over a pool", refraction_scene, POOL, 3, **TRACED),
     exact("index_1", "a point light over a pool of index 1", lambda: refraction_scene(1.0), POOL, 3, **TRACED),
     exact("index_3", "a point light over a pool of index 3", lambda: refraction_scene(3.0), POOL, 3, **TRACED),
     exact("slab", "a beam through a glass slab, with up to six reflections inside the slab",
-          lambda: slab_scene(1.5, 40, 10), SLAB, 10, seeds=24, **TRACED),
+          lambda: slab_scene(1.5, 40, 10), SLAB, 10, seeds=32, **TRACED),
     exact("slab_index_3_grazing", "a beam at 85 degrees on a slab of index 3: most of the light is reflected",
           lambda: slab_scene(3.0, 85, 10), SLAB, 10, **TRACED),
 ]  # fmt: skip
@@ -198,8 +198,8 @@ def grazing(degrees: float) -> dict:
 
 def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, depth: int = 3,
           moves: Moves | None = None, left: float = 1e-3, **more: Any) -> ExtremeCase:  # fmt: skip
-    return ExtremeCase(name, about, scene, (), Extrapolated(step, left), image="ptracer", seeds=8, signed=True,
-                       options={"max_depth": depth}, moves=moves or bending(), **more)  # fmt: skip
+    fields = {"image": "ptracer", "seeds": 8, "signed": True, "options": {"max_depth": depth}} | more
+    return ExtremeCase(name, about, scene, (), Extrapolated(step, left), moves=moves or bending(), **fields)
 
 
 ROUGH: dict[str, Any] = {"type": "roughdielectric", "alpha": 0.1}
@@ -211,7 +211,8 @@ MOTION_CASES = [
     moved("sliding_faces", "a surface whose faces slide through the light", surface(), moves=sliding),
     moved("total_reflection", "a surface with waves, beyond the critical angle",  # light from inside
           lambda: pool(glass(), beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256), 0.0015),
-    moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1)),
+    moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, moves=bending(0.1),
+          seeds=12),
     moved("parallel_faces", "a slab with flat faces that begins to bend", moving_slab(0), depth=4),
     moved("thin_slab", "a slab whose thickness is ten ray offsets",
           moving_slab(0, THIN), 0.1, depth=4, moves=bending(THIN), spp=256),
@@ -363,7 +364,11 @@ def plate(kind: str, roughness: str) -> dict:
 ROUGHNESS = ("1", "0.1", "1e-2", "1e-4")
 
 #: Roughnesses whose derivative is checked on followed paths. `principled` chooses a lobe and has no such derivative.
-FOLLOWED = [(kind, roughness) for kind in ("roughconductor", "roughdielectric") for roughness in ("0.1", "1e-2")]
+#: The values are the numbers of seeds. With fewer seeds, the noise hides the derivative, or single seeds dominate it.
+FOLLOWED = {("roughconductor", "0.1"): 32, ("roughconductor", "1e-2"): 16,
+            ("roughdielectric", "0.1"): 64, ("roughdielectric", "1e-2"): 32}  # fmt: skip
+#: Numbers of seeds that decide noisy derivatives by roughness.
+SEEDS = {("principled", "1e-2"): 40, ("principled", "1e-4"): 40}
 NOISE = "the noise of a roughness's derivative grows as 1 / roughness: equal seeds decide"
 
 
@@ -375,7 +380,7 @@ def _case(kind: str, roughness: str) -> ExtremeCase:
         f"{kind}_{roughness}", f"light that a {kind} of roughness {roughness} reflects or transmits",
         lambda: plate(kind, roughness),
         (f"plate.bsdf.{colour}.value", RECEIVER, *([key] if differentiated else [])), Stock("prb"), spp=256,
-        signed=differentiated, open_ended={key: NOISE} if is_noisy else {},
+        signed=differentiated, open_ended={key: NOISE} if is_noisy else {}, seeds=SEEDS.get((kind, roughness), 16),
     )  # fmt: skip
 
 
@@ -397,7 +402,7 @@ def _followed(kind: str, roughness: str) -> ExtremeCase:
     return ExtremeCase(
         f"{kind}_{roughness}_followed", f"light whose direction follows the roughness {roughness} of a {kind}",
         scene, (), Extrapolated(0.05 * float(roughness), 2e-3), image="", spp=256, signed=True,
-        seeds=64 if kind == "roughdielectric" else 16,  # single seeds would dominate the variance
+        seeds=FOLLOWED[kind, roughness],
         options={"max_depth": 3},  # from the plate to the floor: the edges beyond do not move
         ours={"attached": True}, equal=5e-4, moves=lambda scene: [Number("plate.bsdf.alpha.value")],
     )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 
 from reslrb_cli.estimators import ATTACHED, ESTIMATORS
 from reslrb_cli.integrators.step import gradient_step
-from reslrb_cli.measure.comparison import Family, compare_equal_seeds, compare_expectations
+from reslrb_cli.measure.comparison import ALPHA, Family, compare_equal_seeds, compare_expectations, entry_count
 from reslrb_cli.measure.gradients import Case, extrapolated, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.methods import parse_cases, records_of
@@ -58,6 +58,9 @@ class Stock:
     def reference(self) -> Reference:
         return Reference(self.name)
 
+    def directions(self, setup: Case) -> int:
+        return 0
+
     def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         other = setup if self.scene is None else Case(self.scene(), case.keys)
         other.weights = setup.weights
@@ -81,8 +84,11 @@ class Differences:
     sides: str = "both"
     reference = Reference.FINITE_DIFFERENCE
 
+    def directions(self, setup: Case) -> int:
+        return 2
+
     def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
-        directions = setup.directions(2)
+        directions = setup.directions(self.directions(setup))
         along = directions if self.sides == "both" else np.abs(directions)
         tracer = integrator("reslrb", **without_roulette(case), **case.way)
         paired = "rr_depth" not in case.options
@@ -105,6 +111,9 @@ class Extrapolated:
     left: float = 1e-3
     reference = Reference.FINITE_DIFFERENCE
 
+    def directions(self, setup: Case) -> int:
+        return setup.size
+
     def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         along = np.eye(setup.size)
         tracer = integrator("reslrb", **without_roulette(case))
@@ -121,6 +130,9 @@ class Exact:
 
     known: Callable[[], KnownScene]
     reference = Reference.ANALYTIC
+
+    def directions(self, setup: Case) -> int:
+        return 0
 
     def samples(self, case: ExtremeCase, setup: Case) -> ReferenceGradients:
         return ReferenceGradients(self.known().gradient(setup.weights))
@@ -211,8 +223,11 @@ def without_roulette(case: ExtremeCase) -> dict[str, Any]:
     return {key: value for key, value in case.options.items() if key != "rr_depth"}
 
 
-#: Number of comparisons for the correction of all z scores of the suite; slightly more than it has.
-FAMILY = Family(rows=1500, entries=30000)
+#: The suite has fewer cases. Each case gets an equal share of the probability that correct gradients fail anywhere.
+MOST_CASES = 100
+
+#: The name of images in `ExtremeCase.open_ended`.
+IMAGE = "image"
 
 #: Negative values up to this share of the largest entry count as rounding.
 BELOW_ZERO = 1e-5
@@ -228,17 +243,39 @@ def run_case(
     for label in (*ESTIMATORS, *WAYS) if estimators is None else estimators:
         estimator, way = split(label)
         groups.setdefault(str(way), (way, {}))[1][label] = estimator
+    runs = []
     for way, members in groups.values():
-        setup.weights = type(setup.weights)(plain)
         if way and case.moves is not None:
             continue  # moving light has derivatives only on light paths
         reason = _hidden_from(case, setup) if way.get("paths") == "camera" else None
-        if reason is not None:
-            for label in members:
-                none = Comparison(Verdict.NO_REFERENCE, message=reason)
-                yield _record(case, label, None, Reference.PRB, Kind.EXPECTATION, none)
+        runs.append((_seen_by(case, setup, way) if way else case, members, reason))
+    family = _family(setup, [(seen, members) for seen, members, reason in runs if reason is None])
+    for seen, members, reason in runs:
+        setup.weights = type(setup.weights)(plain)
+        if reason is None:
+            yield from _run_way(seen, setup, members, family)
             continue
-        yield from _run_way(_seen_by(case, setup, way) if way else case, setup, members)
+        none = Comparison(Verdict.NO_REFERENCE, message=reason)
+        for label in members:
+            yield _record(case, label, None, Reference.PRB, Kind.EXPECTATION, none)
+
+
+def _family(setup: Case, runs: Iterable[tuple[ExtremeCase, Mapping[str, str]]]) -> Family:
+    """Return the correction for all comparisons of a case by z scores."""
+    sizes = [entry_count(shape) for *_, shape in _parameters(setup)]
+    entries: list[int] = []
+    for case, members in runs:
+        for name in _taking_part(case, members).values():
+            entries += sizes if case.naive and not ESTIMATORS[name].exact else []
+            along = case.source.directions(setup)
+            entries += [along] if along else sizes if case.seeds > 1 else []
+            entries += [entry_count(tuple(setup.weights.shape))] if case.image else []
+    return Family(len(entries), sum(entries), ALPHA / MOST_CASES)
+
+
+def _taking_part(case: ExtremeCase, members: Mapping[str, str]) -> dict[str, str]:
+    """Return the estimators of `members` that have the derivatives of the case."""
+    return {label: name for label, name in members.items() if case.moves is None or name in ATTACHED}
 
 
 #: Label of camera paths, next to the estimators of light paths, as in `--estimators`.
@@ -282,7 +319,7 @@ def _seen_by(case: ExtremeCase, setup: Case, way: Mapping[str, Any]) -> ExtremeC
     return replace(case, **changed)
 
 
-def _run_way(case: ExtremeCase, setup: Case, members: Mapping[str, str]) -> Iterator[GradcheckRecord]:
+def _run_way(case: ExtremeCase, setup: Case, members: Mapping[str, str], family: Family) -> Iterator[GradcheckRecord]:
     """Run estimators that trace the same kinds of paths. `members` has the name of each estimator by its label."""
     weights = np.array(setup.weights) if case.weights is None else case.weights(np.array(setup.weights))
     # Refused values of dL/dI count as zero, and references never get them.
@@ -296,13 +333,11 @@ def _run_way(case: ExtremeCase, setup: Case, members: Mapping[str, str]) -> Iter
         tracer = integrator(case.image, **without_roulette(case))
         stock = np.stack([setup.image(tracer, seed, case.spp) for seed in seeds_of(case.seeds, 2)])
     setup.weights = type(setup.weights)(weights)
-    for label, name in members.items():
-        if case.moves is not None and name not in ATTACHED:
-            continue
+    for label, name in _taking_part(case, members).items():
         gradients, images, refused = _steps(case, setup, name)
-        rows = list(_comparisons(case, setup, name, gradients, naive, reference))
+        rows = list(_comparisons(case, setup, name, gradients, naive, reference, family))
         if stock is not None:
-            rows.append((None, Reference(case.image), Kind.IMAGE, _images(images, stock)))
+            rows.append((None, Reference(case.image), Kind.IMAGE, _images(case, images, stock, family)))
         if not np.isfinite(weights).all():
             rows.append((None, Reference.ANALYTIC, Kind.EQUAL_SEEDS, _refusals(weights, refused)))
         for row in rows:
@@ -340,7 +375,13 @@ def _refusals(weights: np.ndarray, refused: list[int]) -> Comparison:
 
 
 def _comparisons(
-    case: ExtremeCase, setup: Case, name: str, ours: np.ndarray, naive: np.ndarray | None, reference: ReferenceGradients
+    case: ExtremeCase,
+    setup: Case,
+    name: str,
+    ours: np.ndarray,
+    naive: np.ndarray | None,
+    reference: ReferenceGradients,
+    family: Family,
 ) -> Iterator[tuple[str | None, Reference, Kind, Comparison]]:
     for parameter, columns, shape in _parameters(setup):
         rounding = setup.rounding(parameter)
@@ -350,22 +391,20 @@ def _comparisons(
             if ESTIMATORS[name].exact:
                 kind, found = Kind.EQUAL_SEEDS, compare_equal_seeds(mine, its, equal)
             else:
-                kind, found = (
-                    Kind.EXPECTATION,
-                    compare_expectations(mine, its, FAMILY, shape=shape, rounding=rounding),
-                )
+                kind = Kind.EXPECTATION
+                found = compare_expectations(mine, its, family, shape=shape, rounding=rounding)
             yield parameter, Reference.WALK_AD, kind, _settled(case, parameter, found, mine)
         if reference.along is None:
             mine, its = ours[:, columns], reference.values[..., columns]
             if len(ours) == 1:  # no samples for a standard error
                 found = compare_equal_seeds(mine, np.atleast_2d(its), equal)
             else:
-                found = compare_expectations(mine, its, FAMILY, shape=shape, paired=reference.paired, rounding=rounding)
+                found = compare_expectations(mine, its, family, shape=shape, paired=reference.paired, rounding=rounding)
             yield parameter, case.source.reference, Kind.EXPECTATION, _settled(case, parameter, found, mine)
     if reference.along is not None:
         mine = ours @ reference.along.T
         found = compare_expectations(
-            mine, reference.values, FAMILY, paired=reference.paired, bias=reference.bias, rounding=setup.rounding()
+            mine, reference.values, family, paired=reference.paired, bias=reference.bias, rounding=setup.rounding()
         )
         yield None, case.source.reference, Kind.EXPECTATION, _settled(case, None, found, mine)
 
@@ -402,10 +441,9 @@ def _not_negative(found: Comparison, ours: np.ndarray, share: float) -> Comparis
     return found
 
 
-def _images(ours: np.ndarray, stock: np.ndarray) -> Comparison:
-    shape = ours.shape[1:]
+def _images(case: ExtremeCase, ours: np.ndarray, stock: np.ndarray, family: Family) -> Comparison:
     flat, other = ours.reshape(len(ours), -1), stock.reshape(len(stock), -1)
-    found = compare_expectations(flat, other, FAMILY, shape=shape, paired=False)
+    found = compare_expectations(flat, other, family, shape=ours.shape[1:], paired=False)
     if found.verdict is Verdict.UNREACHED:
         return replace(found, verdict=Verdict.HOLDS, message="black")
-    return _not_negative(found, ours, 0)
+    return _not_negative(_settled(case, IMAGE, found, flat), flat, 0)
