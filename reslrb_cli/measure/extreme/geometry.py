@@ -198,7 +198,7 @@ def grazing(degrees: float) -> dict:
 
 def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, depth: int = 3,
           moves: Moves | None = None, left: float = 1e-3, **more: Any) -> ExtremeCase:  # fmt: skip
-    fields = {"image": "ptracer", "seeds": 8, "signed": True, "options": {"max_depth": depth}} | more
+    fields: dict[str, Any] = {"image": "ptracer", "seeds": 8, "signed": True, "options": {"max_depth": depth}} | more
     return ExtremeCase(name, about, scene, (), Extrapolated(step, left), moves=moves or bending(), **fields)
 
 
