@@ -34,7 +34,7 @@ COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|dat
 #: Uniform emission of lamps.
 EMISSION = re.compile(r"\b(radiance|irradiance|intensity)(\.values?)?$")
 #: Ranges at whose ends Mitsuba's derivative is not that of the image, by the class of the BSDF and the name of the
-#: parameter. At the ends Mitsuba leaves a lobe out, or differentiates a square root or a ratio at 0.
+#: parameter. At the ends Mitsuba leaves a lobe out, differentiates a square root or a ratio at 0, or divides by 0.
 _OPEN: dict[str, dict[str, tuple[float, float]]] = {
     "Principled": {"spec_trans": (0, 1), "metallic": (-np.inf, 1), "clearcoat": (0, np.inf), "sheen": (0, np.inf),
                    "base_color": (0, np.inf), "specular": (0, np.inf)},
@@ -44,6 +44,7 @@ _OPEN: dict[str, dict[str, tuple[float, float]]] = {
     "MaskBSDF": {"opacity": (0, 1)},
     "SmoothConductor": {"eta": (0, np.inf), "k": (0, np.inf)},
     "RoughConductor": {"eta": (0, np.inf), "k": (0, np.inf)},
+    "Hair": {"longitudinal_roughness": (0, np.inf), "azimuthal_roughness": (0, np.inf)},
 }  # fmt: skip
 #: Distance from such a bound. Paths find a lobe of this weight, and images do not show it.
 MARGIN = 1e-3
@@ -53,7 +54,10 @@ _WEIGHTS = {
     ("Principled", "sheen_tint"): "sheen",
     ("PrincipledThin", "sheen_tint"): "sheen",
     **{("PrincipledThin", name): "spec_trans" for name in ("eta", "anisotropic", "spec_tint")},
+    **{(kind, "k"): "eta" for kind in ("SmoothConductor", "RoughConductor")},
 }
+#: Pigments of hair, which an absorption replaces.
+_MELANINS = {("Hair", "eumelanin"), ("Hair", "pheomelanin")}
 #: Parameters that only change polarised light, by class and name.
 _POLARISED = {("LinearPolarizer", "theta"), ("LinearRetarder", "theta"), ("LinearRetarder", "delta")}
 #: Maximum number of printed values; larger arrays show mean and range.
@@ -109,11 +113,15 @@ def unused(params: Any, key: str, recovered: Container[str] = ()) -> str | None:
     """Return the reason why a parameter has no effect at the scene's values, or None if it has an effect. Weights in
     `recovered` leave 0.
     """
-    weight = _WEIGHTS.get(owner_of(params, key))
+    owner, node, names = owner_of(params, key), params.properties[key][2], key.split(".")
+    start = ".".join(names[: -1 if isinstance(node, mi.BSDF) else -2])
+    if owner == ("SpotLight", "texture") and not node.is_spatially_varying():
+        return f"has no effect, because Mitsuba only reads images there; recover `{start}.intensity` instead"
+    if owner in _MELANINS and any(other.startswith(f"{start}.sigma_a.") for other in params.properties):
+        return f"has no effect, because the scene file gives `sigma_a`; recover `{start}.sigma_a` instead"
+    weight = _WEIGHTS.get(owner)
     if weight is None:
         return None
-    names = key.split(".")
-    start = ".".join(names[: -1 if isinstance(params.properties[key][2], mi.BSDF) else -2])
     others = [other for other in params.properties if other.startswith(f"{start}.{weight}.")]
     zero = all(np.all(as_numbers(entry_value(params, other)) == 0) for other in others)
     if not zero or any(other in recovered for other in others):

@@ -92,6 +92,7 @@ class SceneNeeds:
     blends: tuple[mi.BSDF, ...] = ()  # BSDFs of surfaces with a blend of singular and smooth lobes
     # BSDFs of surfaces that are masks, with their opacity, and BSDFs with a mask nested in them, with None.
     masks: tuple[tuple[mi.BSDF, mi.Texture | None], ...] = ()
+    null_halves: tuple[mi.BSDF, ...] = ()  # blends without masks, and masks over a BSDF with null lobes
     lamps: tuple[Lamp, ...] = ()  # shapes that emit
     small_lamps: tuple[Lamp, ...] = ()  # emitting shapes smaller than a pixel in view
 
@@ -127,6 +128,7 @@ def scene_needs(scene: Any, sensor: Any, lit: Sequence[int] | None = None) -> Sc
     is_projective = sensor.class_name() in SENSORS
     near_clip, lens_clip = _clip_planes(scene, sensor) if is_projective else (False, False)
     params = mi.traverse(sensor)
+    blends, masks = uneven_blends(graph), _masks(graph)
     others = [bsdf for bsdf in graph.of_type(mi.BSDF) if bsdf.class_name() not in _FOLLOWED_BSDFS]
     unfollowed = {owner for bsdf in others for owner in graph.owning_bsdfs(bsdf)}
     return SceneNeeds(
@@ -152,8 +154,9 @@ def scene_needs(scene: Any, sensor: Any, lit: Sequence[int] | None = None) -> Sc
         near_clip=near_clip,
         lens_clip=lens_clip,
         unfollowed=tuple(bsdf for bsdf in graph.surface_bsdfs() if bsdf in unfollowed),
-        blends=uneven_blends(graph),
-        masks=_masks(graph),
+        blends=blends,
+        masks=masks,
+        null_halves=_null_halves(graph, blends, masks),
         lamps=lamps,
         small_lamps=small_lamps(scene, sensor, lamps) if is_projective else (),
     )
@@ -196,6 +199,15 @@ def _masks(graph: SceneGraph) -> tuple[tuple[Any, Any], ...]:
         opacity = next(child for child in graph.children[mask] if isinstance(child, mi.Texture))
         found |= {owner: opacity if owner is mask else None for owner in graph.owning_bsdfs(mask)}
     return tuple((bsdf, found[bsdf]) for bsdf in graph.surface_bsdfs() if bsdf in found)
+
+
+def _null_halves(graph: SceneGraph, blends: Iterable[Any], masks: Iterable[tuple[Any, Any]]) -> tuple[Any, ...]:
+    """Return the BSDFs in which a null event may belong to one of two parts. A blend with a mask in it is left out."""
+    opacities = dict(masks)
+    parts = {mask: [part for part in graph.children[mask] if isinstance(part, mi.BSDF)]
+             for mask, opacity in opacities.items() if opacity is not None}  # fmt: skip
+    layered = [mask for mask in parts if int(parts[mask][0].flags()) & int(mi.BSDFFlags.Null)]
+    return (*(blend for blend in blends if blend not in opacities), *layered)
 
 
 def is_bent(mesh: Any) -> bool:

@@ -87,7 +87,7 @@ _RADIANCE = re.compile(r"\bradiance\.value$")
 _BOUNDS = (
     (r"(reflectance|transmittance|base_color|color\d)\.(values?|data)$", "[0, 1]"),
     (r"\b(vertex|face)_\w*$", "[0, 1]"),
-    (r"\b(alpha\w*|roughness)(\.(value|data))?$", "[0.02, 1]"),
+    (r"\b(alpha\w*|\w*roughness)(\.(value|data))?$", "[0.02, 1]"),
     (r"\b(eta|k)\.(values?|data)$", "[0, 10]"),
     (r"\b(eta|nd)$", "[1.01, 3]"),
     (r"\bVd$", "[10, 100]"),

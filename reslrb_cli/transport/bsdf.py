@@ -82,10 +82,10 @@ def _singular_factor(
     if plan.differentiate_null:
         null = active & scattering.is_null
         f = dr.select(null, bsdf.eval_null_transmission(si, null), f)
-    if plan.differentiate_delta or (plan.differentiate_null and plan.needs.blends):
-        # Both halves of a blend may have a null lobe, but an event belongs to one half.
-        of_half = scattering.is_null & blended & ~is_one_of(bsdf, [mask for mask, _ in plan.needs.masks])
-        delta = active & (scattering.is_delta | of_half)
+    halves = plan.needs.null_halves if plan.differentiate_null else ()
+    if plan.differentiate_delta or halves:
+        # Two parts of a BSDF may have null lobes, but an event belongs to one of them.
+        delta = active & (scattering.is_delta | (scattering.is_null & is_one_of(bsdf, halves)))
         sample_1 = _defensive(scattering.sample_1)[1] if mixes(plan) else scattering.sample_1
         bs, weight = bsdf.sample(context_of(plan), si, sample_1, scattering.sample_2, delta)
         pdf = bs.pdf
@@ -97,7 +97,7 @@ def _singular_factor(
             once = dr.detach(pdf)
             if opacity is not None:
                 o = dr.clip(opacity.eval_1(si, here), 0, 1)
-                once = pdf * (dr.detach(o) / o)
+                once = dr.select(sample_1 < o, pdf * (dr.detach(o) / o), once)
             pdf = dr.select(here, once, pdf)
         f = dr.select(delta, weight * pdf - smooth, f)
     return f

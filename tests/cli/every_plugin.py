@@ -1,14 +1,14 @@
 """Every plugin that Mitsuba 3.9.1 ships, and those of `reslrb` for scenes, in a separate scene, and how the program
 treats this scene. This module is docs/plugins.md as data.
 
-`python tests/cli/every_plugin.py` writes the page again. Its table of derivatives is from conformance/keys.json. Each
-plugin has at least one row. Each place or form of the plugin that is treated differently has another row.
+`python tests/cli/every_plugin.py` writes the page again. Its table of derivatives is from conformance/every_key.py.
+Each plugin has at least one row. Each place or form of the plugin that is treated differently has another row.
 """
 
 from __future__ import annotations
 
-import json
 import struct
+import sys
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,6 @@ import numpy as np
 
 from reslrb_cli.scene.dispersion import GLASS, ILLUMINANT, SENSITIVITY
 
-KEYS = Path(__file__).resolve().parents[1] / "conformance" / "keys.json"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "plugins.md"
 #: Kinds of plugins, and the headings of the page for them.
 KINDS = {"bsdf": "BSDFs", "shape": "Shapes", "emitter": "Emitters", "texture": "Textures and spectra",
@@ -476,10 +475,14 @@ DERIVATIVES = """
 
 Each parameter that `reslrb inspect` lists as recoverable is tested: its derivative by `reslrb` is compared with
 differences of images at the same random numbers, inside of its range and at both bounds. The objective is a weighted
-sum of pixels. A cell has the difference, the derivative, and the standard error of their distance. Differences have an
-error of up to 2 % by their step. A derivative that is 10 % off fails the test. `pytest -m long
-tests/conformance/test_every_key.py` repeats all comparisons; without `-m long` it repeats two.
-Parameters that move light have tests of their own.
+sum of pixels. A cell has the difference, the derivative, the standard error of their distance, and in brackets their
+distance in standard errors (z). Differences have an error of up to 2 % by their step, so z is large where the standard
+error is tiny. A derivative that is 10 % off fails the test. `pytest -m long tests/conformance/test_every_key.py`
+repeats all comparisons; without `-m long` it repeats a few. Parameters that move light have tests of their own.
+
+Cells marked "noisy" cannot show a derivative that is 10 % off. For smooth `plastic` and `thindielectric`, samples
+change between mirrored and other light, and closed forms test the derivative instead. The other noisy cells have no
+such test.
 
 Stock Mitsuba 3.9.1 fails some of these comparisons. `reslrb` corrects or refuses:
 
@@ -490,6 +493,12 @@ Stock Mitsuba 3.9.1 fails some of these comparisons. `reslrb` corrects or refuse
     so the derivative at a bound is 0. A run keeps these parameters 0.001 away from such a bound.
 - `eta` and `k` of conductors have the derivative 0 at 0. `base_color` and `specular` of `principled`, and `base_color`
     of `principledthin`, have an infinite derivative there. A run keeps them at 0.001 or more.
+- `longitudinal_roughness` and `azimuthal_roughness` of `hair`. At 0 Mitsuba divides by 0, and the hair is black. A run
+    keeps them at 0.001 or more, and `init` at 0.02 or more.
+- All parameters of a `mask` over a BSDF that lets light straight through, such as `thindielectric`. The derivative of
+    light through the mask was counted twice. `reslrb` corrects this.
+- `k` of conductors has no effect while `eta` is 0 (without a `material`, `eta` is 0), `eumelanin` and `pheomelanin` of
+    `hair` if the scene file gives `sigma_a`, and `texture` of a `spot` without an image. They are refused.
 - `clearcoat_gloss` and `sheen_tint`; `eta`, `anisotropic` and `spec_tint` of `principledthin`. They have no effect
     while the weight of their lobe is 0, and are refused if the weight is not recovered as well.
 - `theta` and `delta` of polarisers and retarders have no effect without polarised light, and are refused.
@@ -502,11 +511,14 @@ Stock Mitsuba 3.9.1 fails some of these comparisons. `reslrb` corrects or refuse
 
 def derivatives() -> list[str]:
     """Return the rows of the table of derivatives."""
+    from conformance.every_key import stored  # needs this module
+
     found: dict[tuple[str, str], dict[str, str]] = {}
-    for one in json.loads(KEYS.read_text(encoding="utf-8")):
-        place = f"inside {one['paths']}" if one["at"] == "inside" else one["at"]
-        fd, ad, error = f"{one['fd']:.3g}", f"{one['ad']:.3g}", f"{one['error']:.0e}"
-        found.setdefault((one["form"], one["key"]), {})[place] = f"{fd} / {ad} ± {error}"
+    for one in stored():
+        place = f"inside {one.paths}" if one.at == "inside" else one.at
+        noisy = "" if one.resolved else ", noisy"
+        cell = f"{one.fd:.3g} / {one.ad:.3g} ± {one.error:.0e} ({one.z:+.1f}{noisy})"
+        found.setdefault((one.form, one.key), {})[place] = cell
     rows = []
     for (form, key), cells in found.items():
         plugin, _, options = form.partition(" ")
@@ -516,9 +528,10 @@ def derivatives() -> list[str]:
     measured = {form.partition(" ")[0] for form, _ in found}
     tested = dict.fromkeys(row.plugin for row in ROWS if row.kind in ("bsdf", "emitter", "texture") and not row.refused)
     others = [f"`{name}`" for name in tested if name not in measured]
-    note = f"\nThe long test also covers these plugins, whose numbers are not in the table: {', '.join(others)}.\n"
+    note = f"\nThese plugins have no parameter that can be recovered: {', '.join(others)}.\n"
     return [*rows, note] if others else rows
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     PAGE.write_text(page(), encoding="utf-8")

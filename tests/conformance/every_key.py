@@ -43,50 +43,20 @@ RESOLVED = 0.06
 #: Lamps of BSDFs, samples per pixel at first and at most, segments of paths, and step relative to the range.
 POINT = '<emitter type="point"><point name="position" {}/><rgb name="intensity" value="8, 9, 7"/></emitter>'
 POINTS = POINT.format('x="0.5" y="2" z="2.5"') + POINT.format('x="-0.4" y="1" z="-2"')
-STAGES = ((POINTS, 2**7, 2**9, 2, 0.004), (LIGHT.format(RADIANCE), 2**10, 2**12, 3, 0.02))
+STAGES = ((POINTS, 2**7, 2**11, 2, 0.004), (LIGHT.format(RADIANCE), 2**10, 2**12, 3, 0.02))
 #: Lower ends of ranges, by the end of the name. Mitsuba renders a `specular` of 0 as 0.001. Few samples meet the narrow
 #: peak of a lower roughness. The derivative by a k below 0.001 changes by tens of per cent, and a tint jumps at black.
-LOWEST = {"Principled.specular": 1e-3, "Conductor.k": 1e-3, ".base_color": 1e-3, ".roughness": 0.15,
-          ".alpha": 0.15, ".alpha_u": 0.15, ".alpha_v": 0.15}  # fmt: skip
+#: A normal map below 0.5 turns normals into the surface.
+LOWEST = {"Principled.specular": 1e-3, "Conductor.k": 1e-3, "NormalMap.normalmap": 0.6, ".base_color": 1e-3,
+          ".roughness": 0.15, "al_roughness": 0.15, ".alpha": 0.15, ".alpha_u": 0.15, ".alpha_v": 0.15}  # fmt: skip
 #: Factors of the step, by the end of the name or of the name with the point. The width of the clearcoat's peak falls to
 #: a hundredth at a gloss of 1. The image is linear in `sheen_tint`, whose small effect would drown in rounding.
 STEPS = {"Conductor.eta": 0.1, "Conductor.k": 0.1, "RoughPlastic.eta": 3, "RoughPlastic.eta low": 1,
-         "RoughPlastic.alpha": 5, "PolarizedPlastic.eta low": 0.1,
+         "RoughPlastic.eta high": 10, "RoughPlastic.alpha": 5, "PolarizedPlastic.eta low": 0.1,
          ".clearcoat_gloss high": 0.05, ".sheen_tint": 10, ".base_color low": 0.02,
          "Conductor.k low": 0.01}  # fmt: skip
-#: Rounding of the tables that Mitsuba makes of a parameter, relative to the objective and equal for all seeds. The
-#: terms of eta nearly cancel unless the plastic is nonlinear.
+#: Rounding of the tables that Mitsuba makes of a parameter, relative to the objective and equal for all seeds.
 ROUNDING = {"RoughPlastic.eta": 2e-3, "RoughPlastic.alpha": 3e-3}
-#: Forms whose outcomes are not in keys.json yet. The long test measures them.
-UNMEASURED: tuple[str, ...] = (
-    "conductor",
-    "conductor without a material",
-    "roughconductor anisotropic",
-    "roughconductor without a material",
-    "plastic nonlinear",
-    "pplastic anisotropic",
-    "mask over thindielectric",
-    "twosided over roughplastic",
-    "bumpmap",
-    "circular",
-    "dispersivedielectric",
-    "dispersivedielectric with `alpha`",
-    "twosided with a blend of rough BSDFs",
-    "blendbsdf of a mirror and a rough BSDF",
-    "roughconductor with spectra",
-    "hair",
-    "hair with `sigma_a`, in a mask",
-    "measured",
-    "measured_polarized",
-    "area with an image",
-    "area with an image, on a `cube`",
-    "area with a texture other than an image",
-    "directionalarea",
-    "spot",
-    "spot with an image",
-    "constvolume in a texture",
-    "gridvolume in a texture",
-)
 
 
 def _rgb(name: str, value: str) -> str:
@@ -107,7 +77,9 @@ GGX, NONLINEAR = '<string name="distribution" value="ggx"/>', '<boolean name="no
 COPPER = '<string name="material" value="Cu"/>'
 ROUGH_COPPER = _bsdf("roughconductor", COPPER + _floats(alpha=0.3))
 PLASTIC = _bsdf("plastic", SPECULAR + DIFFUSE)
-ROUGH_PLASTIC = _bsdf("roughplastic", _floats(alpha=0.3) + SPECULAR + DIFFUSE)
+#: By eta, the derivatives of a bright peak and of the diffuse lobe nearly cancel.
+DULL = _rgb("specular_reflectance", "0.2, 0.15, 0.1")
+ROUGH_PLASTIC = _bsdf("roughplastic", _floats(alpha=0.3) + DULL + DIFFUSE)
 THIN_GLASS = _bsdf("thindielectric", SPECULAR + THROUGH)
 #: BSDFs with all their parameters, by plugin and form. A plugin without an entry has the form of every_plugin.py.
 FORMS = {
@@ -126,7 +98,7 @@ FORMS = {
     "plastic": {"": PLASTIC, "nonlinear": _bsdf("plastic", NONLINEAR + SPECULAR + DIFFUSE)},
     "roughplastic": {
         "": ROUGH_PLASTIC,
-        "nonlinear": _bsdf("roughplastic", NONLINEAR + GGX + _floats(alpha=0.4) + SPECULAR + DIFFUSE),
+        "nonlinear": _bsdf("roughplastic", NONLINEAR + GGX + _floats(alpha=0.4) + DULL + DIFFUSE),
     },
     "pplastic": {
         "": _bsdf("pplastic", _floats(alpha=0.3) + SPECULAR + DIFFUSE),
@@ -153,6 +125,7 @@ FORMS = {
         "": _bsdf("blendbsdf", _floats(weight=0.4) + MATERIALS["diffuse"] + ROUGH_COPPER),
     },
     "bumpmap": {"": MATERIALS["bumpmap"].replace(MATERIALS["diffuse"], ROUGH_PLASTIC)},
+    "hair": {"": _bsdf("hair", "")},
 }  # fmt: skip
 
 
@@ -218,14 +191,15 @@ class Form:
     stages: tuple[Stage, ...]
 
     @property
-    def paths(self) -> list[str]:
-        """Kinds of paths that render the scene."""
-        return [kind for kind, why in (("light", self.row.light), ("camera", self.row.camera)) if not why]
+    def points(self) -> dict[str, tuple[str, ...]]:
+        """Points at which a parameter is tested, by the kinds of paths that render the scene. The last kind takes the
+        bounds.
+        """
+        kinds = [kind for kind, why in (("light", self.row.light), ("camera", self.row.camera)) if not why]
+        return {kind: ("inside", "low", "high") if kind == kinds[-1] else ("inside",) for kind in kinds}
 
     def owns(self, key: str) -> bool:
         """Return whether a key belongs to the plugin, and not to the rest of the scene."""
-        if self.name.endswith("without a material") and key.endswith(".k.value"):
-            return False  # its effect is proportional to eta, which starts at 0
         if 'id="thing"' in self.stages[0][0]:
             return key.startswith("thing")
         return not key.startswith(("floor", "lamp.bsdf"))
@@ -236,7 +210,8 @@ def forms() -> list[Form]:
     found = []
     for row in (row for row in ROWS if row.kind in KINDS and not row.refused):
         if row.kind != "bsdf":
-            found.append(Form(row.name, row, ((_small(row.xml()), *STAGES[1][1:]),)))
+            _, first, most, *rest = STAGES[1]
+            found.append(Form(row.name, row, ((_small(row.xml()), first, 4 * most, *rest),)))  # type: ignore[arg-type]
             continue
         known = FORMS.get(row.plugin, {"": ""}) if not row.where else {"": ""}
         for form, bsdf in known.items():
@@ -298,6 +273,14 @@ def _range(params: Any, info: Any) -> tuple[float, float]:
     return low, high
 
 
+def point(params: Any, info: Any, at: str) -> float | None:
+    """Return the value of a parameter `at` its lower or upper bound, or NaN `inside`. An infinite bound gives None."""
+    low, high = _range(params, info)
+    low = max(low, _by_end(LOWEST, -np.inf, identity(params, info.key).partition(" ")[0]))
+    value = {"inside": np.nan, "low": low, "high": high}[at]
+    return None if np.isinf(value) else value
+
+
 def measure(form: Form, folder: Path, paths: str, points: tuple[str, ...], fault: float = 1.0, only: str = "",
             stages: slice = slice(None)) -> Iterator[Outcome]:  # fmt: skip
     """Yield the outcome of each key of a form at the `points`. `fault` multiplies the derivative of `reslrb`."""
@@ -347,10 +330,9 @@ def _measure(form: Form, stage: Stage, folder: Path, paths: str, points: tuple[s
         scale = high - low if np.isfinite(high - low) else float(np.abs(inside[key]).mean()) or 1.0
         for at in (at for at in points if wanted is None or (key, at) in wanted):
             name = identity(case.params, key).partition(" ")[0]
-            low = max(low, _by_end(LOWEST, -np.inf, name))
-            value = inside[key] if at == "inside" else np.full_like(inside[key], low if at == "low" else high)
-            if not np.all(np.isfinite(value)):
+            if (bound := point(case.params, info, at)) is None:
                 continue
+            value = inside[key] if at == "inside" else np.full_like(inside[key], bound)
             h = step * scale * _by_end(STEPS, 1, f"{name} {at}", name)
             sides = {"inside": "both", "low": "up", "high": "down"}[at]
             if at == "inside" and np.any((value - h < low) | (value + h > high)):
@@ -407,9 +389,7 @@ def main(names: list[str], file: Path = RESULTS) -> None:
             if names and not any(re.fullmatch(pattern, form.name) for pattern in names):
                 continue
             found, start = [], time.monotonic()
-            for number, paths in enumerate(form.paths):
-                # Bounds take one of the two kinds of paths.
-                points = ("inside", "low", "high") if number == len(form.paths) - 1 else ("inside",)
+            for paths, points in form.points.items():
                 for outcome in measure(form, folder, paths, points):
                     found.append(outcome)
                     mark = "ok " if outcome.holds and outcome.resolved else "BAD"

@@ -250,6 +250,8 @@ def with_bsdf(make_scene, **bsdf):
     ({"type": "principledthin"}, "diff_trans.value", 2.0, 1.999),
     ({"type": "principledthin"}, "diff_trans.value", 0.4, 0.4),
     ({"type": "roughconductor"}, "eta.value", None, 0.001),
+    ({"type": "hair"}, "longitudinal_roughness", 0.0, 0.001),
+    ({"type": "hair"}, "azimuthal_roughness", 0.0, 0.001),
     ({"type": "mask", "opacity": 1.0, "inside": {"type": "diffuse"}}, "opacity.value", None, 0.999),
 ])  # fmt: skip
 def test_starts_and_bounds_are_where_a_derivative_exists(make_scene, caplog, bsdf, key, given, starts):
@@ -280,6 +282,8 @@ UNUSED = [
     ("principledthin", "eta", "spec_trans"),
     ("principledthin", "anisotropic", "spec_trans"),
     ("principledthin", "spec_tint", "spec_trans"),
+    ("conductor", "k", "eta"),
+    ("roughconductor", "k", "eta"),
 ]
 
 
@@ -296,6 +300,23 @@ def test_a_parameter_without_effect_is_refused(make_scene, kind, name, weight):
     assert select(scene, {"key": key}, {"key": other}).keys == [key, other]
     positive = with_bsdf(make_scene, type=kind, **{weight: 0.5})
     assert select(positive, {"key": key}).keys == [key]
+
+
+def test_only_an_image_shapes_the_light_of_a_spot(make_scene):
+    even = make_scene(lamp={"type": "spot"})
+    with pytest.raises(ConfigError, match=r"`lamp.texture.value` has no effect.*; recover `lamp.intensity` instead"):
+        select(even, {"key": "lamp.texture.value"})
+    data = mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32))
+    image = make_scene(lamp={"type": "spot", "texture": {"type": "bitmap", "data": data, "raw": True}})
+    assert select(image, {"key": "lamp.texture.data"}).keys == ["lamp.texture.data"]
+
+
+@pytest.mark.parametrize("name", ["eumelanin", "pheomelanin"])
+def test_an_absorption_replaces_the_pigments_of_hair(make_scene, name):
+    key = f"plane.bsdf.{name}"
+    assert select(with_bsdf(make_scene, type="hair", **{name: 0.3}), {"key": key}).keys == [key]
+    with pytest.raises(ConfigError, match=rf"`{key}` has no effect.*; recover `plane.bsdf.sigma_a` instead"):
+        select(with_bsdf(make_scene, type="hair", sigma_a={"type": "rgb", "value": [0.2, 0.3, 0.4]}), {"key": key})
 
 
 def test_a_glob_leaves_out_parameters_without_effect(make_scene):
