@@ -39,13 +39,26 @@ def _shorten(text: str, most: int) -> str:
     return f"{text[: most - 3 - end]}...{text[len(text) - end :]}"
 
 
+def similar(name: str, known: Iterable[str], count: int = 1, cutoff: float = 0.6) -> list[str]:
+    """Return at most `count` of the `known` names that are similar to `name`, the most similar one first. Case does not
+    matter. Similarities lie between 0 and 1, and a name with less than `cutoff` does not count.
+    """
+    names = {each.lower(): each for each in known}
+    return [names[each] for each in difflib.get_close_matches(name.lower(), names, n=count, cutoff=cutoff)]
+
+
+def did_you_mean(name: str, known: Iterable[str], count: int = 1, cutoff: float = 0.6, otherwise: str = "") -> str:
+    """Return "did you mean `a` or `b`?" with the `similar` names, or `otherwise` if there are none."""
+    near = similar(name, known, count, cutoff)
+    return f"did you mean {' or '.join(f'`{each}`' for each in near)}?" if near else otherwise
+
+
 def known_name(kind: str, name: str, names: Iterable[str]) -> str:
     """Return `name` as `names` spell it. Case does not matter. Raises ValueError with the nearest names, or all."""
     known = {each.lower(): each for each in names}
     if name.lower() in known:
         return known[name.lower()]
-    near = [known[each] for each in difflib.get_close_matches(name.lower(), known)]
-    hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(known.values())}"
+    hint = did_you_mean(name, known.values(), 3, otherwise=f"known are {', '.join(known.values())}")
     raise ValueError(f"there is no {kind} {name!r}; {hint}")
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from reslrb_cli.errors import LINE_LENGTH, MESSAGE_LENGTH, ConfigError, NonFinite, one_line, printable
+from reslrb_cli.errors import LINE_LENGTH, MESSAGE_LENGTH, ConfigError, NonFinite, did_you_mean, one_line, printable
 from reslrb_cli.seeds import seed
 
 # The content of a message: one line of bounded length that cannot control the terminal.
@@ -69,3 +71,18 @@ def test_seeds_are_uniform_in_their_range():
         counts[seed(0, iteration, 0, "image") >> 28] += 1
     # Each of 16 bins expects 256. Chi-square with 15 degrees of freedom exceeds 45 in 1 of 10000 cases
     assert sum((count - 256) ** 2 / 256 for count in counts) < 45
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "options", "text"),
+    [
+        ("OPTIMISE", ["optimize", "render"], {}, "did you mean `optimize`?"),
+        ("n-bk7", ["N-BK7", "N-BAK4"], {"count": 2}, "did you mean `N-BK7` or `N-BAK4`?"),
+        ("n-bk7", ["N-BK7", "N-BAK4"], {}, "did you mean `N-BK7`?"),
+        ("xyz", ["optimize"], {"otherwise": "there is no other"}, "there is no other"),
+        ("xyz", ["optimize"], {"cutoff": 0}, "did you mean `optimize`?"),
+        ("xyz", [], {"cutoff": 0}, ""),
+    ],
+)  # fmt: skip
+def test_similar_names_are_proposed(name: str, known: list[str], options: dict[str, Any], text: str) -> None:
+    assert did_you_mean(name, known, **options) == text

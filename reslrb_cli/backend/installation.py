@@ -9,7 +9,6 @@ then in its own folder.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import importlib.util
 import os
@@ -22,7 +21,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from reslrb_cli.backend.shared_library import missing_library
-from reslrb_cli.errors import BackendError
+from reslrb_cli.errors import BackendError, did_you_mean, similar
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -86,10 +85,12 @@ def likely_parameters(name: str) -> list[str]:
     return []
 
 
-def nearest_plugin(name: str, type: mi.ObjectType) -> str | None:
-    """Return the plugin of type `type` whose name is most similar to `name`, or None."""
-    near = difflib.get_close_matches(name.lower(), sorted(shipped_plugins()), n=5)
-    return next((candidate for candidate in near if plugin_type(candidate) == type), None)
+def propose_plugin(name: str, *types: mi.ObjectType) -> str:
+    """Return a question with the plugin of these types whose name is most similar to `name`. If there is none, return
+    the rule.
+    """
+    known = [near for near in similar(name, sorted(shipped_plugins()), 5) if plugin_type(near) in types]
+    return did_you_mean(name, known, otherwise="only Mitsuba's own plugins are loaded")
 
 
 @functools.cache

@@ -7,7 +7,6 @@ package. The module is loaded when the command is called.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import importlib
 import logging
 import os
@@ -19,7 +18,7 @@ from typing import Any
 import click
 
 from reslrb_cli.cli.terminal import Interrupts, LogLines, tell
-from reslrb_cli.errors import LINE_LENGTH, ExitCode, one_line
+from reslrb_cli.errors import LINE_LENGTH, ExitCode, did_you_mean, one_line
 from reslrb_cli.version import __version__
 
 # Summaries for `reslrb --help`, which does not load the commands; in the order of a user's work.
@@ -61,9 +60,9 @@ class _Main(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        near = difflib.get_close_matches(args[0], _SUMMARIES, n=1)
-        if near and args[0] not in _SUMMARIES and not ctx.resilient_parsing:
-            raise click.UsageError(f"No such command {args[0]!r}; did you mean `{near[0]}`?", ctx)
+        hint = did_you_mean(args[0], _SUMMARIES)
+        if hint and args[0] not in _SUMMARIES and not ctx.resilient_parsing:
+            raise click.UsageError(f"No such command {args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

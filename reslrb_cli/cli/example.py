@@ -6,7 +6,6 @@ wheel, `reslrb_cli/examples` contains copies.
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import shlex
@@ -18,7 +17,7 @@ from click.shell_completion import CompletionItem
 
 import reslrb_cli
 from reslrb_cli.cli.terminal import echo
-from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.errors import ConfigError, ExitCode, did_you_mean
 from reslrb_cli.records.atomic import write_atomically
 
 FOLDER = Path(reslrb_cli.__file__).parent / "examples"
@@ -66,8 +65,7 @@ def command(name: str | None, folder: Path | None) -> int:
             echo(f"{each:{width}}  {_about(path)}")
         return ExitCode.DONE
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean `{near[0]}`?" if near else f"there are {', '.join(known)}"
+        hint = did_you_mean(name, known, otherwise=f"there are {', '.join(known)}")
         raise ConfigError("NAME", "", f"no example is called `{name}`; {hint}")
     config = copy(known[name], folder or Path(name.rpartition("/")[2]))
     echo(f"look at {os.path.relpath(config)}, then: reslrb optimize {shlex.quote(os.path.relpath(config))}")

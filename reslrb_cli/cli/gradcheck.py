@@ -4,7 +4,6 @@ lack.
 
 from __future__ import annotations
 
-import difflib
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -34,7 +33,7 @@ from reslrb_cli.cli.terminal import Interrupts, echo
 from reslrb_cli.config.integrators import ESTIMATOR_OPTIONS
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
-from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.errors import ConfigError, ExitCode, did_you_mean
 from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_checked
 from reslrb_cli.records.measurements import GradcheckRecord, Verdict
 
@@ -108,8 +107,7 @@ def run_suite(options: GradcheckOptions) -> int:
     names = [name.strip() for name in listed.split(",")] if listed else []
     for name in names:
         if name not in CASES:
-            near = difflib.get_close_matches(name, CASES, n=1) or ["furnace"]
-            raise ConfigError("--suite", "", f"there is no case `{name}`; did you mean {near[0]}?")
+            raise ConfigError("--suite", "", f"there is no case `{name}`; {did_you_mean(name, CASES, cutoff=0)}")
     echo(f"{device_name(variant)}, {variant}")
     records: list[GradcheckRecord] = []
     keeper = Keeper(options.json_file, origin_of(variant), lambda: records)

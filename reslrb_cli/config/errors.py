@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -15,6 +13,7 @@ from pydantic_core import ErrorDetails
 from reslrb_cli.config.base import MARK, Section
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import Location, format_location
+from reslrb_cli.errors import did_you_mean
 
 _EXPECTED = {
     "int_type": "an integer",
@@ -158,15 +157,9 @@ def _unknown_key(loc: tuple[int | str, ...]) -> str:
     if owners:
         return f"not an option of {_type_name(chosen)} but of {', '.join(owners)}; remove it, or change the type"
     here = format_location(tuple(part for part in loc[:-1] if not _is_tag(part)))
-    meant = _nearest(key, chosen.model_fields) or _below(chosen, here, key) or _below(Config, "", key)
-    if meant:
-        return f"unknown key; did you mean `{meant[0]}`?"
-    return f"unknown key; known here: {', '.join(chosen.model_fields)}"
-
-
-def _nearest(word: str, known: Iterable[str]) -> list[str]:
-    """Return the most similar known word, if there is one."""
-    return difflib.get_close_matches(word.lower(), list(known), n=1)
+    below = [*_below(chosen, here, key), *_below(Config, "", key)]
+    otherwise = f"did you mean `{below[0]}`?" if below else f"known here: {', '.join(chosen.model_fields)}"
+    return f"unknown key; {did_you_mean(key, chosen.model_fields, otherwise=otherwise)}"
 
 
 def _below(section: type[Section], name: str, key: str) -> list[str]:
@@ -183,9 +176,9 @@ def _below(section: type[Section], name: str, key: str) -> list[str]:
 
 def _one_of(known: list[str], value: Any) -> str:
     known = list(dict.fromkeys(known))  # a union within a union names its members twice
-    near = _nearest(value, known) if isinstance(value, str) else []
+    hint = did_you_mean(value, known) if isinstance(value, str) else ""
     choices = " or ".join(known) if len(known) < 3 else "one of " + ", ".join(known)
-    return choices + (f" (did you mean {near[0]}?)" if near else "")
+    return choices + (f" ({hint})" if hint else "")
 
 
 def _but_is(message: str, value: Any) -> str:

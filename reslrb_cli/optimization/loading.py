@@ -5,7 +5,6 @@ A pass is small enough to fit into memory.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
@@ -18,7 +17,7 @@ from reslrb_cli.config.integrators import Integrator, Own, ReslrbConfig, WalkAdC
 from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import IN_MEMORY, Config
-from reslrb_cli.errors import ConfigError, UnsupportedScene
+from reslrb_cli.errors import ConfigError, UnsupportedScene, did_you_mean
 from reslrb_cli.integrators.context import sensors_in_words
 from reslrb_cli.integrators.freezing import MOST_PATHS_APART
 from reslrb_cli.integrators.own import load_estimator
@@ -196,8 +195,7 @@ def find_sensor(given: int | str, ids: Sequence[str], source: object, key: str) 
         places = [place for name in (given, sensor_id(given)) for place, id in enumerate(ids) if id == name]
         if places:
             return places[0]
-        near = difflib.get_close_matches(given, ids, n=3, cutoff=0.5) or ids[:3]
-        raise ConfigError(source, key, f"is {given}, which is no sensor of the scene; did you mean {', '.join(near)}?")
+        raise ConfigError(source, key, f"is {given}, which is no sensor of the scene; {did_you_mean(given, ids, 3, 0)}")
     named = next((id for place, id in enumerate(ids) if id.isdecimal() and int(id) == given != place), None)
     if named is not None:
         reason = f'is the number {given}, which could be an index or the sensor "{named}"; write an id in quotes'
@@ -220,8 +218,7 @@ def lit_emitters(config: Config, scene: mi.Scene) -> dict[int, tuple[int, ...]]:
             own = {index for index, known in enumerate(names) if any(fnmatchcase(name, lamp) for name in known)}
             if not own:
                 shown = [emitter.id() if (shape := emitter.get_shape()) is None else shape.id() for emitter in emitters]
-                near = difflib.get_close_matches(lamp, shown, n=3, cutoff=0.5) or shown[:3]
-                reason = f"is `{lamp}`, which is no lamp of the scene; did you mean {', '.join(near)}?"
+                reason = f"is `{lamp}`, which is no lamp of the scene; {did_you_mean(lamp, shown, 3, 0)}"
                 raise ConfigError(config.source, f"views[{place}].lamps[{number}]", reason)
             lit |= own
         if lit and len(lit) < len(emitters):

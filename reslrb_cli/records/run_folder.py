@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import itertools
 import os
@@ -26,7 +25,7 @@ from reslrb_cli.config.loader import Override, changed, load, parse_override
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import format_location
-from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault
+from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, similar
 from reslrb_cli.records import metrics
 from reslrb_cli.records.atomic import remove_parts, unfinished_folder, write_atomically
 from reslrb_cli.records.checkpoint import PARAMETERS_FILE, STATE_FILE, newest_checkpoint, open_archive
@@ -63,7 +62,7 @@ def read_value(run: Path, key: str) -> Array:
         known = [name.removeprefix(prefix) for name in archive if name.startswith(prefix)]
         if key in known:
             return archive[f"{prefix}{key}"].astype(np.float32)
-    near = difflib.get_close_matches(key, known, n=_SHOWN, cutoff=0.5) or known[:_SHOWN]
+    near = similar(key, known, _SHOWN, 0)
     has = " and ".join(f"`{name}`" for name in near) or "nothing"
     more = f" and {len(known) - len(near)} more" if len(known) > len(near) else ""
     raise ConfigError(run, "", f"did not recover `{key}`; it has {has}{more}")

@@ -22,7 +22,6 @@ passes. In forward mode, `push` propagates tangents from the recovered values to
 
 from __future__ import annotations
 
-import difflib
 import enum
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,6 +32,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.parameters import ANGLES, AXES, HEIGHTMAP
+from reslrb_cli.errors import did_you_mean
 from reslrb_cli.scene.graph import bounds, face_normals, triangles
 
 #: Analytic shapes whose `to_world` moves their surface interactions and their samples.
@@ -133,10 +133,8 @@ def find_movable(params: mi.SceneParameters, id: str) -> Movable | str:
         return Movable(id, key, node) if reason is None else f"`{id}` cannot be moved: {reason}"
     if any(key.startswith(f"{id}.") for key in params.properties):
         return f"`{id}` has neither vertices nor a position that can be moved"
-    known = [item.id for item in list_movable(params)]
-    near = difflib.get_close_matches(id, known, n=3, cutoff=0.4) or known[:3]
-    hint = f"; did you mean {' or '.join(f'`{name}`' for name in near)}?" if near else "; nothing here can be moved"
-    return f"there is no `{id}` in the scene{hint}"
+    hint = did_you_mean(id, [item.id for item in list_movable(params)], 3, 0, otherwise="nothing here can be moved")
+    return f"there is no `{id}` in the scene; {hint}"
 
 
 def list_movable(params: mi.SceneParameters) -> list[Movable]:

@@ -6,7 +6,6 @@ A `Selection` has the parameters' settings, and transfers values to and from the
 
 from __future__ import annotations
 
-import difflib
 import functools
 import logging
 from collections.abc import Collection, Mapping, Sequence
@@ -19,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
+from reslrb_cli.errors import did_you_mean
 from reslrb_cli.scene.catalog import MARGIN, ParameterInfo, describe, list_parameters, open_domain, unused
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
 from reslrb_cli.scene.load import warn_once
@@ -369,16 +369,15 @@ def matching_keys(params: mi.SceneParameters, pattern: str, place: Place, names:
     matches = [pattern] if is_key else [key for key in params.properties if fnmatchcase(key, pattern)]
     if not matches:
         recoverable = [info.key for info in list_parameters(params) if _obstacle(info) is None]
-        near = difflib.get_close_matches(pattern, [*names, *recoverable], n=3, cutoff=0.5)
-        near = near or difflib.get_close_matches(pattern, recoverable, n=3, cutoff=0)
-        hint = " or ".join(f"`{key}`" for key in near)
+        nearest = did_you_mean(pattern, recoverable, 3, 0)
+        hint = did_you_mean(pattern, [*names, *recoverable], 3, 0.5, otherwise=nearest)
         id, _, word = pattern.rpartition(".")
         if word in (*WORDS, HEIGHTMAP) and isinstance(find_movable(params, id), Movable):
             kind = "heightmap" if word == HEIGHTMAP else "motion"
             raise place.fail(
                 "key", f"`{pattern}` belongs to a {kind} of `{id}`, and `parameters` has none of this kind"
             )
-        raise place.fail("key", f"`{pattern}` matches no parameter of the scene; did you mean {hint}?")
+        raise place.fail("key", f"`{pattern}` matches no parameter of the scene; {hint}")
     infos = [describe(params, key) for key in matches]
     usable = [info.key for info in infos if _obstacle(info) is None]
     if not usable:

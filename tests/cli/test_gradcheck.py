@@ -111,7 +111,7 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert lines[1].endswith("holds")
     assert lines[-1] == f"{len(rows)} of {len(rows)} comparisons hold, 0 fail"
     assert call("--suite", "extreme:furnac") == 2
-    assert "there is no case `furnac`; did you mean furnace?" in capsys.readouterr().err
+    assert "there is no case `furnac`; did you mean `furnace`?" in capsys.readouterr().err
 
 
 def test_a_stopped_suite_keeps_finished_cases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -109,11 +109,11 @@ def test_colours_move_only_with_an_exposure_that_all_views_share(folder, sets, i
 BAD = [
     ("views=[{sensor: 0}, {sensor: 0}]", "views[1].sensor", "is already in views[0]"),
     ("views=[{lamps: [lamp]}, {lamps: [lamp]}]", "views[1].sensor", "views of one sensor need different `lamps`"),
-    ("views=[{lamps: [lmp]}]", "views[0].lamps[0]", "no lamp of the scene; did you mean lamp?"),
+    ("views=[{lamps: [lmp]}]", "views[0].lamps[0]", "no lamp of the scene; did you mean `lamp`?"),
     ("views=[{lamps: []}]", "views[0].lamps", "must name a lamp"),
     ("views=[{sensor: 4}, {sensor: 4, lamps: [lamp]}]", "views[0].sensor", "is 4, but the scene has 3 sensors"),
     ("views=[{sensor: 7}]", "views[0].sensor", "3 sensors"),
-    ("views=[{sensor: Perspective_9}]", "views[0].sensor", "no sensor of the scene; did you mean Perspective_"),
+    ("views=[{sensor: Perspective_9}]", "views[0].sensor", "no sensor of the scene; did you mean `Perspective_"),
     ("views=[{sensor: 0}, {sensor: Perspective_1}]", "views[1].sensor", "is also the sensor of views[0]"),
     ("views=[{sensor: 0, target: missing.exr}, {sensor: 1}]", "views[0].target", "no such file"),
     ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has its own target"),
@@ -125,7 +125,7 @@ BAD = [
     ("views=[{sensor: 0, mask: auto}]", "views[0].mask", "must be `none` or the path of an image"),
     ("target.exposure=-1", "target.exposure", "must be a positive number, `auto` or `per_channel`"),
     ("target.mask=3", "target.mask", "must be `auto`, `none`"),
-    ("target.white_balance={scene: D64}", "target.white_balance.scene", "did you mean D65 or"),
+    ("target.white_balance={scene: D64}", "target.white_balance.scene", "did you mean `D65` or"),
     ("target.white_balance={photograph: A}", "target.white_balance", "has no effect on a rendered target"),
 ]
 

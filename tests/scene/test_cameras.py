@@ -181,7 +181,7 @@ def test_ids_of_cameras_may_be_numbers_or_have_dashes(folder):
         assert [view.sensor for view in make(folder, path.name, f"held_out: [{given}], ").trained] == trained
     with pytest.raises(ConfigError, match=r'held_out\[0\]: is the number 1, which could be an index or .* "0001"'):
         make(folder, path.name, "held_out: [0001], ")
-    with pytest.raises(ConfigError, match=r"held_out\[0\]: is DSC-002, .* did you mean DSC_001\?"):
+    with pytest.raises(ConfigError, match=r"held_out\[0\]: is DSC-002, .* did you mean `DSC_001`"):
         make(folder, path.name, "held_out: [DSC-002], ")
 
 

@@ -47,7 +47,7 @@ def test_the_catalogue_has_the_indices_of_data_sheets() -> None:
     page = (ROOT / "docs" / "spectral.md").read_text(encoding="utf-8")
     for name, glass in GLASSES.items():
         assert f"| `{name}` | {glass.nd:.5f} | {glass.Vd:.2f} | {glass.source} |" in page
-    with pytest.raises(ValueError, match="did you mean N-BK7"):
+    with pytest.raises(ValueError, match="did you mean `N-BK7`"):
         find_glass("BK7")
 
 
@@ -201,7 +201,7 @@ def test_variants_without_wavelengths_have_the_index_at_d(llvm: str) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"material": "BK7"}, "did you mean N-BK7"),
+        ({"material": "BK7"}, "did you mean `N-BK7`"),
         ({"nd": 1.5}, "both `nd` and `Vd`"),
         ({"nd": 0.9, "Vd": 50.0}, "nd above 1"),
         ({"sellmeier": "1, 2, 3"}, "as many coefficients B as C"),
@@ -232,14 +232,14 @@ def test_a_white_surface_has_the_colour_of_the_illuminant(llvm: str) -> None:
     assert colours[llvm, "D65"] == pytest.approx([0.5, 0.5, 0.5], abs=2e-3)
     for name in ("D65", "A", "LED-B3"):
         assert colours[with_them, name] == pytest.approx(colours[llvm, name], abs=0.015), name
-    with pytest.raises(Exception, match="there is no illuminant 'D64'; did you mean D65"):
+    with pytest.raises(Exception, match="there is no illuminant 'D64'; did you mean `D65`"):
         mi.load_dict({"type": "illuminant", "name": "D64"})
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"camera": "Nikon D5100", "channel": "red"}, "no camera 'Nikon D5100'; did you mean Nikon 5100"),
+        ({"camera": "Nikon D5100", "channel": "red"}, "no camera 'Nikon D5100'; did you mean `Nikon 5100`"),
         ({"camera": "Nikon 5100", "channel": "R"}, "no channel 'R'; known are red, green, blue"),
         ({"camera": "Nikon 5100", "channel": "red"}, "needs wavelengths"),
     ],

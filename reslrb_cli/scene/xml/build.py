@@ -6,7 +6,6 @@ Before Mitsuba parses a description, plugins that are not Mitsuba's own are refu
 from __future__ import annotations
 
 import bisect
-import difflib
 import logging
 import math
 import os
@@ -20,8 +19,8 @@ from typing import Any
 
 import mitsuba as mi
 
-from reslrb_cli.backend.installation import is_known, likely_parameters, looking_in, nearest_plugin, plugin_type
-from reslrb_cli.errors import ConfigError, one_line
+from reslrb_cli.backend.installation import is_known, likely_parameters, looking_in, plugin_type, propose_plugin
+from reslrb_cli.errors import ConfigError, did_you_mean, one_line
 from reslrb_cli.scene.images import texture_problems
 from reslrb_cli.scene.xml.mend import Note
 from reslrb_cli.scene.xml.read import Description, Element, floats, is_true, quoted, tag_lines
@@ -162,9 +161,7 @@ def _check_plugin(element: Element) -> None:
     others = {"bsdf": "BSDF", "phase": "PhaseFunction", "rfilter": "ReconstructionFilter", "spectrum": "Texture"}
     wanted = getattr(mi.ObjectType, others.get(tag, tag.capitalize()))
     if not is_known(type):
-        near = nearest_plugin(type, wanted)
-        hint = f"; did you mean `{near}`?" if near else "; only Mitsuba's own plugins are loaded"
-        raise element.fail("", f"there is no {tag} {quoted(type)} in Mitsuba 3{hint}")
+        raise element.fail("", f"there is no {tag} {quoted(type)} in Mitsuba 3; {propose_plugin(type, wanted)}")
     if plugin_type(type) not in (mi.ObjectType.Unknown, wanted):
         raise element.fail("", f"{quoted(type)} is no {tag}")
     if type == "bitmap" and element.find("filename") is None:
@@ -314,10 +311,10 @@ def _unused(props: mi.Properties, element: Element) -> list[Note]:
             child = unnamed[int(number[1])]
             wrong = f"{element.type} does not use a <{child.tag}> in Mitsuba 3"
         else:
-            near = difflib.get_close_matches(name, likely_parameters(element.type), n=1, cutoff=0.75)
-            hint = f" (did you mean `{near[0]}`?)" if near else ""
+            hint = did_you_mean(name, likely_parameters(element.type), cutoff=0.75)
             child = element.find(name) or element
-            wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3{hint}"
+            wrong = f"{element.type} has no parameter {quoted(child.written or name)} in Mitsuba 3"
+            wrong += f" ({hint})" if hint else ""
         notes.append(Note(child, wrong, None if child is element else element))
     return notes
 

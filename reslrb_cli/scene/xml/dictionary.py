@@ -18,7 +18,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.backend.installation import is_known, nearest_plugin, plugin_type
+from reslrb_cli.backend.installation import is_known, plugin_type, propose_plugin
 from reslrb_cli.errors import ConfigError, MachineError, one_line
 from reslrb_cli.records.atomic import unfinished_folder
 from reslrb_cli.records.decisions import cache_folder
@@ -209,9 +209,7 @@ class _Writer:
                 key, f"{quoted(type)} is a plugin of your own, which a scene file cannot name; {_INSTEAD[3:]}"
             )
         kinds = (mi.ObjectType.Shape, mi.ObjectType.BSDF, mi.ObjectType.Emitter, mi.ObjectType.Texture)
-        near = next((found for each in kinds if (found := nearest_plugin(type, each))), None)
-        hint = f"; did you mean `{near}`?" if near else "; only Mitsuba's own plugins are loaded"
-        raise self._fail(key, f"there is no plugin {quoted(type)} in Mitsuba 3{hint}")
+        raise self._fail(key, f"there is no plugin {quoted(type)} in Mitsuba 3; {propose_plugin(type, *kinds)}")
 
     def _fail(self, key: str, message: str) -> ConfigError:
         return ConfigError(self._source, key, message)
