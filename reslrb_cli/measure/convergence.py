@@ -14,7 +14,7 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.draws import Stored, mixed_sessions, situation
+from reslrb_cli.measure.draws import StoredResults, mixed_sessions, situation
 from reslrb_cli.measure.engine import NO_TIME, Engine, Member, Request, Role
 from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import ConvergencePlan, NamedIntegrator
@@ -98,7 +98,7 @@ class Session(Engine):
             if found is None:
                 self.say(f"dL/dI was not computed: {NO_TIME}")
                 return False
-            stored = Stored(**found)
+            stored = StoredResults(**found)
             self.file.store(self._survey_about, stored)
         self.facts, self._arrays = stored.facts, stored.arrays
         return True
@@ -203,7 +203,7 @@ class Session(Engine):
         if member.refusal is not None:
             self.say(f"left out: {own.label}: {member.refusal}")
             if member.refusal.exit_code == ExitCode.USAGE:
-                self.file.store(own.about, Stored({"refusal": str(member.refusal)}, {}))
+                self.file.store(own.about, StoredResults({"refusal": str(member.refusal)}, {}))
         elif member.failure is not None:
             self.say(f"{own.label}: {member.status.value}: {member.failure.reason}")
         elif member.alive:

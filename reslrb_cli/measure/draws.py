@@ -5,7 +5,7 @@ statistic cost only the missing draws.
 
 A file is an `.npz` archive. `header` is JSON with one entry for each set of draws: its label and options, and `about`,
 which names everything that determines a draw. The arrays of entry N are `N/values`, `N/seeds` and so on. Results that
-draws depend on, such as dL/dI, are stored beside the draws (`Stored`). Does not import Mitsuba.
+draws depend on, such as dL/dI, are stored beside the draws (`StoredResults`). Does not import Mitsuba.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def situation(config: Config, variant: str, **others: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredResults:
     """Results that draws depend on: `facts` as JSON, and arrays."""
 
     facts: Mapping[str, Any]
@@ -174,7 +174,7 @@ class DrawsFile:
         self.path = None if path is None else as_path(path, "draws", "a file")
         self._about: dict[str, dict[str, Any]] = {}
         self._parts: dict[str, list[Draws]] = {}
-        self._stored: dict[str, Stored] = {}
+        self._stored: dict[str, StoredResults] = {}
         self._changed, self._seen = False, self._state()
         if self._seen is not None:
             self._read()
@@ -200,11 +200,11 @@ class DrawsFile:
         self._parts.setdefault(key, []).append(draws)
         self._changed = True
 
-    def stored(self, about: Mapping[str, Any]) -> Stored | None:
+    def stored(self, about: Mapping[str, Any]) -> StoredResults | None:
         """Return the results that are stored for a situation, or None."""
         return self._stored.get(key_of(dict(about)))
 
-    def store(self, about: Mapping[str, Any], stored: Stored) -> None:
+    def store(self, about: Mapping[str, Any], stored: StoredResults) -> None:
         """Store results for a situation."""
         self._stored[key_of(dict(about))] = stored
         self._changed = True
@@ -271,6 +271,6 @@ class DrawsFile:
                 self._about.setdefault(key, about)
                 self._parts.setdefault(key, []).append(Draws(**entry, **own))
             for number, entry in enumerate(header["stored"]):
-                found = Stored(entry["facts"], entries_below(arrays, f"stored {number}/"))
+                found = StoredResults(entry["facts"], entries_below(arrays, f"stored {number}/"))
                 self._stored.setdefault(entry["key"], found)
         self._seen = self._state()

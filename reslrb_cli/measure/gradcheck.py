@@ -32,7 +32,7 @@ from reslrb_cli.measure.comparison import (
     compare_expectations,
     entry_count,
 )
-from reslrb_cli.measure.draws import Draws, DrawsFile, Stored
+from reslrb_cli.measure.draws import Draws, DrawsFile, StoredResults
 from reslrb_cli.measure.engine import NO_TIME
 from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette, records_of
@@ -175,7 +175,7 @@ class Gradcheck:
             if len(rows) > (known := self._on_file.get(name, 0)):
                 about = self._about[name]
                 self.file.add(about, Draws.of(about["purpose"], rows[known:], seeds(len(rows))[known:]))
-                self.file.store(about, Stored(self.participants.facts(name[1]), {}))
+                self.file.store(about, StoredResults(self.participants.facts(name[1]), {}))
                 self._on_file[name] = len(rows)
         self.file.save()
 

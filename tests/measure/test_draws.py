@@ -13,7 +13,7 @@ from cli.tiny import write_experiment
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import draws as module
-from reslrb_cli.measure.draws import ARRAYS, Draws, DrawsFile, Stored, mixed_sessions, situation, this_session
+from reslrb_cli.measure.draws import ARRAYS, Draws, DrawsFile, StoredResults, mixed_sessions, situation, this_session
 
 ABOUT = {"settings": "a", "spp": 4}
 
@@ -68,7 +68,7 @@ def test_a_file_has_what_was_added(workplace: Path, path: str | None) -> None:
     file.add(ABOUT, some(1, 2, options={"a": [1, None]}, scratch_bytes=4))
     file.add(ABOUT, some(2, 5))
     file.add(ABOUT | {"spp": 8}, some(1, label="other"))
-    file.store(ABOUT, Stored({"shapes": {"a": [2]}}, {"mask": np.eye(2)}))
+    file.store(ABOUT, StoredResults({"shapes": {"a": [2]}}, {"mask": np.eye(2)}))
     file.save()
     read = DrawsFile(place) if place is not None else file
     found, stored = read.draws(ABOUT), read.stored(dict(reversed(ABOUT.items())))
