@@ -31,8 +31,6 @@ from reslrb_cli.transport.sobol import evenly, unit
 
 #: Length of an interval that is tested for a jump, in cells of the plane.
 INTERVAL = 0.5
-#: Smallest `Jump.places`, in cells. It limits the weight of jumps that are rarely found.
-NARROWEST = 0.02
 #: Bisections of an interval.
 BISECTIONS = 15
 #: Largest distance in cells between places whose difference gives dq/du.
@@ -150,7 +148,7 @@ def _find_jump(chains: Chains, line: ScanLine) -> Jump:
     ahead, ahead_returns = run(outer, step, after, before)
     both = dr.maximum(back + ahead - INTERVAL, 0)
     places = 0.5 * (dr.select(ahead_returns, both, back) + dr.select(back_returns, both, ahead))
-    return Jump(inner, outer, back, ahead, dr.maximum(places, NARROWEST), active & (places > 0))
+    return Jump(inner, outer, back, ahead, dr.select(places > 0, places, 1), active & (places > 0))
 
 
 # ---- The edge at a jump ----
