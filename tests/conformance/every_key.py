@@ -106,7 +106,7 @@ FORMS = {
     },
     "principled": {
         "": _bsdf("principled", BASE + _floats(
-            roughness=0.5, metallic=0.3, anisotropic=0.4, spec_trans=0.4, spec_tint=0.3, sheen=0.5, sheen_tint=0.4,
+            roughness=0.5, metallic=0.3, anisotropic=0.4, spec_trans=0.4, spec_tint=0.3, sheen=0.9, sheen_tint=0.4,
             flatness=0.4, clearcoat=0.6, clearcoat_gloss=0.3, eta=1.4)),
         "as exported": _bsdf("principled", BASE + _floats(roughness=0.5, specular=0.4)),
     },
