@@ -29,7 +29,7 @@ _SUMMARIES = {
     "sweep": "Run an experiment at several settings and seeds, and compare.",
     "render": "Render the scene of a configuration.",
     "export": "Write a run's scene, with what it recovered, for Mitsuba alone.",
-    "lens": "Write an experiment that shapes a lens which throws a picture.",
+    "lens": "Write an experiment for a lens that casts a picture.",
     "inspect": "List a scene's parameters and what it contains.",
     "bench": "Measure time and memory of gradient steps.",
     "gradcheck": "Compare gradients with references.",

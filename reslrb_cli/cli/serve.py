@@ -73,7 +73,7 @@ def command(folder: Path, port: int) -> int:
     changes nothing. Ctrl-C ends it.
     """
     if not folder.is_dir():
-        raise ConfigError(folder, "", "no such folder; give the folder that contains the run folders")
+        raise ConfigError(folder, "", "no such file or folder; give the folder that contains the run folders")
     from reslrb_cli.backend.installation import load_packages
 
     load_packages()  # Mitsuba reads the images

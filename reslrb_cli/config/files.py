@@ -60,7 +60,7 @@ def open_file(path: Path) -> BinaryIO:
             raise ConfigError(path, "", "is a pipe, a socket or a device, not a regular file")
         return path.open("rb")
     except FileNotFoundError:
-        raise ConfigError(path, "", "no such file") from None
+        raise ConfigError(path, "", "no such file or folder") from None
     except (OSError, ValueError) as error:  # ValueError: a null character or half of a surrogate pair
         raise ConfigError(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
 

@@ -234,7 +234,7 @@ def scene_xml(surface: Surface, film: tuple[int, int], pixels: int, power: float
     )  # fmt: skip
     camera = rays.middle - away * rays.normal
     return f"""<?xml version="1.0" encoding="utf-8"?>
-<!-- A {setting.kind} that throws a picture; written by reslrb lens. Millimetres, y up: docs/lens.md, "Axes". -->
+<!-- {setting.kind.capitalize()} that casts a picture, by reslrb lens. Lengths in mm, y up: docs/lens.md, "Axes". -->
 <scene version="3.0.0">
     <default name="resx" value="{film[0]}"/>
     <default name="resy" value="{film[1]}"/>
@@ -291,33 +291,33 @@ def lens_yaml(
     plate = f"type: thickness, thickness: {s.thickness:.9g}, least: {least:.4g}, weight: {1e6 / max(s.size) ** 4:.4g}"
     also = f" sun: {sun:g}," if sun else ""
     index = ior if isinstance(ior, str) else f"{ior:g}"
-    return f"""# The {surface.setting.kind} that throws {json.dumps(name)}: {surface.summary()}.
-# Start with
+    return f"""# {s.kind.capitalize()} that casts {json.dumps(name)}: {surface.summary()}.
+# Run it:
 #     reslrb optimize lens.yaml
 scene:
   file: scene.xml
 target:
   file: target.exr
-  mask: none  # nothing is left out for being bright or at the edge: a design's light counts wherever it falls
+  mask: none  # all pixels count, including the brightest pixels and those at the edge
 parameters:
-  - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # mm along +z
-    initial: {{file: start.exr}}  # by transport of light: docs/lens.md
-    precondition: 0.03  # smooth steps: without them the finest ripples decide how long one may be
-    regularizers: [{{{plate}}}]  # mm; faces never cross
+  - heightmap: {{mesh: face, resolution: [{nx}, {ny}]}}  # heights along +z, in mm
+    initial: {{file: start.exr}}  # computed by optimal transport: docs/lens.md
+    precondition: 0.03  # smooths the steps; otherwise the finest ripples limit their length
+    regularizers: [{{{plate}}}]  # lengths in mm; keeps the faces apart
 integrator:
   type: reslrb
   max_depth: {4 if surface.setting.kind == "lens" else 3}
 loss: {{type: l2}}
-# Not Adam: it takes steps as large for what noise says as for what the image does, and a rough face folds the light.
+# Adam would amplify noise, and a rough face scatters light. The steps of gradient descent stay smooth.
 optimizer: {{type: sgd, momentum: 0.9, scale: curvature, learning_rate: 1, schedule: cosine}}
 run:
   iterations: {iterations}
   spp: 64
-  final_spp: 1024  # of the image that is compared: what it has of noise counts against the lens
-  certainty: false  # of a design there is no true value
-fabrication:  # mm; what `reslrb export` makes a solid of
+  final_spp: 1024  # noise in the final image would lower its SSIM
+  certainty: false  # a design has no true values
+fabrication:  # lengths in mm; `reslrb export` writes the solid
   {{kind: {s.kind}, thickness: {s.thickness:.9g}, outline: {s.outline}, ior: {index},{also}
-   picture: picture.exr}}  # as it was, without a floor
+   picture: picture.exr}}  # before dark parts were brightened
 """
 
 

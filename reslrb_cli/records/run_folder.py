@@ -144,7 +144,7 @@ def checkpoint_of(run: Path) -> Path:
 def _manifest_of(run: Path) -> dict[str, Any]:
     """Return the manifest of the run folder `run`, corrected if the run was killed. Raises ConfigError."""
     if not run.is_dir():
-        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such folder"
+        what = "is a file, not the folder of a run" if os.path.lexists(run) else "no such file or folder"
         raise ConfigError(run, "", what)
     content = read_manifest(run)
     if content is None:

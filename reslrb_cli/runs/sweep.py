@@ -290,7 +290,7 @@ def resumed(
     start of the sweep.
     """
     if not folder.is_dir():
-        raise ConfigError(folder, "", "no such folder; start a sweep by `reslrb sweep CONFIG --vary ...`")
+        raise ConfigError(folder, "", "no such file or folder; start a sweep by `reslrb sweep CONFIG --vary ...`")
     with _locked(folder):
         kept = read_sweep(folder)
         _check_files(folder, kept, allow_code)

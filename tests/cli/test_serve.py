@@ -318,7 +318,7 @@ def test_a_page_that_becomes_a_link_is_not_followed(served, runs, monkeypatch):
 
 def test_the_command(llvm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert "runs: no such folder; give the folder that contains the run folders" in reslrb("serve").output
+    assert "runs: no such file or folder; give the folder that contains the run folders" in reslrb("serve").output
     Path("runs").mkdir()
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))

@@ -229,7 +229,7 @@ def test_a_finished_run_is_reported(run: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_a_missing_run_is_reported(tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert told(capsys, tmp_path / "nothing") == f"{tmp_path}/nothing: no such folder"
+    assert told(capsys, tmp_path / "nothing") == f"{tmp_path}/nothing: no such file or folder"
     (tmp_path / "empty").mkdir()
     assert "is no run's folder" in told(capsys, tmp_path / "empty")
     shutil.rmtree(run / "checkpoint")
