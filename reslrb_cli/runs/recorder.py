@@ -54,6 +54,8 @@ class Recording:
     #: Lines for the log file.
     said: list[str] = field(default_factory=list)
     page: LivePage = field(init=False)
+    #: Images at the initial values by sensor, until the first iteration. An interrupt before it must not wait for them.
+    initial: dict[int, Any] = field(default_factory=dict)
     error_maps: dict[str, Any] = field(default_factory=dict)
     seen: dict[str, Any] = field(default_factory=dict)
     certainty: CertaintyRecord | None = None
@@ -179,6 +181,7 @@ class Recording:
                 told = state.scaling
                 metrics.write(record)  # first, because a checkpoint needs the lines of its iterations
                 self.course.add(state, record)
+                self.initial.clear()
                 self.calls.iteration(record)
                 yield record
                 if (fault := self.folder.fault) is not None:  # the folder may have been removed or replaced
@@ -366,10 +369,14 @@ class Recording:
 
     def _write_images(self, name: str) -> None:
         spp = saved_spp(self.problem)
-        if name == "final":
+        if name == "final" and not self.initial:
             logger.info(f"rendering the final image: {spp} spp")
         for view in self.problem.views:
-            image = self.problem.render(view.sensor, spp, self.done, "saved image")
+            image = self.initial.get(view.sensor)
+            if image is None:
+                image = self.problem.render(view.sensor, spp, self.done, "saved image")
+            if not self.done:
+                self.initial[view.sensor] = image
             exposed = view.exposed_array(image)
             self._write_image(name, view.sensor, exposed)
             self.course.results.see(name, view, image)

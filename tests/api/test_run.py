@@ -122,6 +122,9 @@ def test_a_signal_stops_the_measurement_of_curvature(experiment: Path) -> None:
         seen = signal_at_a_gradient(patch, signal.SIGTERM)
         assert optimize("tiny.yaml", "--quiet", *sets, "--set", "run.name=part") == ExitCode.INTERRUPTED
     assert len(seen) == 3
+    assert "rendering the final image" not in Path("runs/part/run.log").read_text(), "it is the initial image"
+    images = Path("runs/part/images")
+    assert (images / "final.exr").read_bytes() == (images / "initial.exr").read_bytes()
     runs = [rl.optimize("tiny.yaml", folder, overrides=DESCENT) for folder in ("runs/loop", None)]
     for run, number, error in zip(runs, (signal.SIGINT, signal.SIGTERM), (KeyboardInterrupt, SystemExit), strict=True):
         with pytest.MonkeyPatch.context() as patch:

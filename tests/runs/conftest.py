@@ -29,11 +29,11 @@ def interrupted(llvm: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         work_in(folder, patch)
         patch.setattr(recording, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
         patch.setattr(recording, "seen_errors", lambda folder, results: {})
-        iterate = recording.Recording._iterate
-        patch.setattr(recording.Recording, "_iterate", lambda self, stop: iterate(self, lambda: self.done == 4))
+        records = recording.Recording.records
+        patch.setattr(recording.Recording, "records", lambda self, stop: records(self, lambda: self.done == 4))
         code = optimize(
             "tiny.yaml", "--quiet", "--set", "run={iterations: 6, checkpoint_every: {iterations: 1}, spp: 4}"
         )
         assert code == 130
-        patch.setattr(recording.Recording, "_iterate", iterate)
+        patch.setattr(recording.Recording, "records", records)
         yield folder / "runs/tiny"
