@@ -189,7 +189,7 @@ def lines(*words: str) -> list[SummaryRecord]:
 def read(path: Path) -> list[str]:
     """Return the text of all lines after the first line. The first line states where the measurement comes from."""
     origin, *others = [json.loads(line) for line in path.read_text().splitlines()]
-    assert origin == {"kind": "summary", "line": "here"}
+    assert origin == {"kind": "summary", "line": "here", "remark": ""}
     return [line["line"] for line in others]
 
 
@@ -277,6 +277,6 @@ def test_a_pipe_gets_all_lines_at_the_end(tmp_path: Path) -> None:
     measured.lines = lines("a")
     measured.keeper.refresh()
     measured.keeper.finish(interrupted=False)
-    assert os.read(reader, 1000).splitlines()[1:] == [b'{"kind": "summary", "line": "a"}']
+    assert os.read(reader, 1000).splitlines()[1:] == [b'{"kind": "summary", "line": "a", "remark": ""}']
     os.close(reader)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]

@@ -162,7 +162,7 @@ def test_a_sweep_of_samples() -> None:
     ]  # fmt: skip
     assert of(results, "reslrb:stack, 16 spp").relative_rmse == pytest.approx(0.5, rel=0.1)
     assert of(results, "reslrb:stack, 16 spp").method.spp == 16
-    assert closing_sentence(results.methods).startswith("Best for this scene: reslrb:stack, 16 spp; 1.3 [")
+    assert closing_sentence(results.methods).startswith("Best for this scene: reslrb:stack, 16 spp; 1.34 [")
     spps = {question["of"]: question["spp"] for question in stage.asked if question["of"]}
     assert spps["case reslrb:stack, 16 spp"] == 16
 
@@ -389,7 +389,7 @@ def test_figures_of_the_table_are_fields_of_the_record() -> None:
         METHOD, "a", BenchStatus.OK, step_s=0.5, repeats=12000, relative_rmse=0.1, slope=-0.5,
         efficiency=Range(2, 1, 3), bias_z=1.5, bias_z_limit=4.5,
     )  # fmt: skip
-    assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2 [1, 3]", "1.5 (4.5) open")
+    assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2.0 [1.0, 3.0]", "1.5 (4.5) open")
 
 
 def test_too_few_steps_have_no_intervals() -> None:
