@@ -51,6 +51,7 @@ ADDED: dict[str, str | tuple[str, ...]] = {
     "fabrication: {thickness: 3, ior: 1}": "fabrication.ior: must be above 1 and at most 5, or the name of a material",
     "run: {xyz: 3}": "run.xyz: unknown key; known here: name, output",
     "spp: 3": ("spp: unknown key", "`run.spp`"),
+    "loss: {spp: 3}": ("loss.spp: unknown key", "`run.spp`"),
     "run: {spp: 0, seed: -1, iterations: x}": ("run.", "(and 2 more)"),
     "run: fast": ("run: must be a mapping", "'fast'"),
     "loss: [l1]": "loss[0]: must be a mapping such as {type: NAME}",

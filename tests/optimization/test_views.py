@@ -114,6 +114,7 @@ BAD = [
     ("views=[{sensor: 4}, {sensor: 4, lamps: [lamp]}]", "views[0].sensor", "is 4, but the scene has 3 sensors"),
     ("views=[{sensor: 7}]", "views[0].sensor", "3 sensors"),
     ("views=[{sensor: Perspective_9}]", "views[0].sensor", "no sensor of the scene; did you mean `Perspective_"),
+    ("views=[{sensor: xyz}]", "views[0].sensor", "no sensor of the scene; did you mean `Perspective_"),
     ("views=[{sensor: 0}, {sensor: Perspective_1}]", "views[1].sensor", "is also the sensor of views[0]"),
     ("views=[{sensor: 0, target: missing.exr}, {sensor: 1}]", "views[0].target", "no such file"),
     ("views=[{sensor: 0, target: a.exr}]", "target.render", "every view has its own target"),

@@ -334,6 +334,7 @@ def test_encodings(tmp_path, encoding):
         ("paint", '<bsdf type="phong" id="paint"/>', "bsdf `phong` is a plugin of Mitsuba 0.6 that Mitsuba 3 does not"),
         ("shape", '<camera type="perspective"/>', "<camera> is an element of Mitsuba before 0.4"),
         ("shape", '<shape type="spere"/>', "there is no shape `spere` in Mitsuba 3; did you mean `sphere`?"),
+        ("shape", '<shape type="difuse"/>', "no shape `difuse` in Mitsuba 3; did you mean `disk`?"),
         ("shape", '<shape type="blender"/>', "shape `blender` reads the memory of a running Blender"),
         ("shape", "<shape/>", "<shape> has no type"),
         ("paint", PARTS["paint"].replace("0.5, 0.25, 1", "#12345"), "must be a colour such as #80ff00, not `#12345`"),
