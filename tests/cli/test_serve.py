@@ -99,7 +99,8 @@ def test_two_runs_are_compared(served, runs):
     answer, text = ask(served, address.replace("&amp;", "&"))
     assert answer.status == 200
     assert 'http-equiv="refresh"' not in text
-    assert text.count("<svg") == 2
+    assert text.count("<svg") == 4  # the loss and the relative error, over iterations and time
+    assert text.count(">relative error of the parameters<") == 2
     assert "cannot be shown" not in text
     assert text.count('alt="target: ') == text.count('alt="final: ') == 2
     rows = text[text.index("Settings that differ") : text.index("Convergence")]
@@ -358,7 +359,7 @@ def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
     chromium.evaluate(click % "with=b")
     assert chromium.wait_for(f"document.body?.textContent.includes('to compare with b') && {loaded}", 10)
     chromium.evaluate(click % "run=a")
-    assert chromium.wait_for(f"document.querySelectorAll('svg').length == 2 && {loaded}", 10)
+    assert chromium.wait_for(f"document.querySelectorAll('svg').length == 4 && {loaded}", 10)
     assert chromium.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
     assert chromium.evaluate("document.images.length") >= 4
     assert chromium.evaluate("document.documentElement.scrollWidth") <= 1280
