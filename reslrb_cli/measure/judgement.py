@@ -36,6 +36,7 @@ from reslrb_cli.measure.convergence import FEWEST, Session
 from reslrb_cli.measure.engine import Member, Role
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
+    FEWEST_AVERAGES,
     TARGETS,
     Method,
     MethodRecord,
@@ -55,9 +56,8 @@ _UNSEEN = "nothing exceeds the reference's noise"
 #: Confidence level of all intervals.
 CONFIDENCE = 0.95
 
-#: Minimum number of steps for a slope, and of averages for an error that counts. The logarithms of the errors of fewer
-#: averages are skewed.
-FEWEST_FOR_SLOPE, FEWEST_AVERAGES = 16, 4
+#: Minimum number of steps for a slope.
+FEWEST_FOR_SLOPE = 16
 
 
 @dataclass(frozen=True)

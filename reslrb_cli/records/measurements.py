@@ -125,6 +125,10 @@ class Method:
     max_depth: int | None = None
 
 
+#: Minimum number of averages for an error that counts. The logarithms of the errors of fewer averages are skewed.
+FEWEST_AVERAGES = 4
+
+
 @dataclass(frozen=True)
 class PointRecord(Line):
     """Error of the average of `steps` steps, which take `elapsed_s` seconds.

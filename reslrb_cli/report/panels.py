@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.records.measurements import MethodRecord, PointRecord
+from reslrb_cli.records.measurements import FEWEST_AVERAGES, MethodRecord, PointRecord
 from reslrb_cli.records.metrics import Line
 from reslrb_cli.report.plots import MOST_POINTS, Curve, Panel
 from reslrb_cli.report.run_summary import units_differ
@@ -32,9 +32,6 @@ MOST_DRAWN = 8
 
 #: Names of a figure and the ends of its interval, in the records.
 ENDS = (("value", "low", "high"), ("median", "min", "max"), ("median", "low", "high"))
-
-#: Errors from fewer averages scatter.
-FEWEST_AVERAGES = 4
 
 
 # --- bench ------------------------------------------------------------------------------------------------------------
@@ -223,9 +220,7 @@ def _relative_errors(run: ShownRun) -> list[float | None]:
     return [total(record["parameter_errors"]) for record in run.records]
 
 
-def _by_iteration(
-    runs: Sequence[ShownRun], figure: Callable[[ShownRun], Sequence[float | None]]
-) -> tuple[Array, Array]:
+def _by_iteration(runs: Sequence[ShownRun], figure: Figure) -> tuple[Array, Array]:
     """Return the iterations (N,) and the figure of each run (runs, N), NaN where unknown."""
     most = max(len(run.records) for run in runs)
     values = np.full((len(runs), most), np.nan)
