@@ -180,8 +180,6 @@ class Replacing:
         replace(owner, number(owner, name, float(value)), *(("eta", "specular") if is_either else ()))
 
     def _put_spectrum(self, owner: Element, name: str, key: str) -> None:
-        if owner.type == "spot" and name == "texture":
-            raise self._fail(key, "Mitsuba requires an image as a spot's texture; recover the spot's intensity instead")
         value, kind = self._array(key), parameter_kind(self.params, key)
         if kind == "emitter" and value.size == 1 and mi.is_spectral:  # a <float> would be multiplied by D65
             replace(owner, owner.new("spectrum", name=name, value=numbers(value)))
