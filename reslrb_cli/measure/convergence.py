@@ -184,7 +184,7 @@ class Session(Engine):
             yield done
 
     def _is_possible(self, member: Member) -> bool:
-        """Whether a method can take part. If an earlier session found that it does not support the scene, it cannot."""
+        """Return False if an earlier session found that the method does not support the scene."""
         stored = self.file.stored(member.request.about)
         if stored is not None and member.request.may_refuse:
             member.end = CannotStart(stored.facts["refusal"], ExitCode.USAGE)
@@ -192,7 +192,7 @@ class Session(Engine):
         return member.end is None
 
     def _is_worthwhile(self, started: list[Member]) -> bool:
-        """Whether there will be results: if cases and the reference have draws, and the time suffices."""
+        """Return True if a case and the reference have draws or a process, and the time suffices for results."""
         usable = {member.request.role for member in self.members if member.alive or member.kept}
         round_s = sum(member.request.count * member.step_s for member in started if member.alive)
         return {Role.CASE, Role.REFERENCE} <= usable and self.pace.fits(FEWEST * round_s)

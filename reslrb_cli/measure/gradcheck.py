@@ -158,7 +158,7 @@ class Gradcheck:
                 say(f"{number + 1} of {self.seeds} seeds, {self._now() - self._begin:.0f} s")
 
     def _recall(self, name: Name) -> list[np.ndarray]:
-        """Return the samples that the file has, and restore the facts that belong to them."""
+        """Return the samples on file, and restore their finite-difference steps and rounding errors."""
         if self.file.path is None:
             return []
         self._about[name] = about = self.participants.about(*name)
@@ -226,7 +226,7 @@ class Gradcheck:
         return entry_count(parts.shape(row.key))
 
     def _compared(self, row: Row, family: Family, why: str) -> GradcheckRecord:
-        """Return the comparison of a row's samples. `why` says why there are too few, if so."""
+        """Return the comparison of a row's samples. `why` is the reason if there are too few samples."""
         count = self._count(row)
         if count == 0:
             return self._record(row, Comparison(Verdict.NOT_MEASURED, message=why), 0)

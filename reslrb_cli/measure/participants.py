@@ -384,12 +384,12 @@ class Participants:
         return situation(config, mi.variant(), purpose=f"gradcheck, {kind} {of}", **own)
 
     def facts(self, of: str) -> dict[str, Any]:
-        """Return the results that samples of `of` brought about: finite-difference steps, and rounding errors."""
+        """Return the finite-difference steps and rounding errors that the samples of `of` have determined."""
         steps = [(direction.step, direction.truncation) for direction in self.directions.get(of, ())]
         return {"steps": steps, "rounding": dict(self.case.roundings)}
 
     def restore(self, of: str, facts: Mapping[str, Any]) -> None:
-        """Restore the result of `facts`."""
+        """Set the steps and rounding errors that `facts` returned."""
         for number, (step, truncation) in enumerate(facts["steps"]):
             self.directions[of][number] = replace(self.directions[of][number], step=step, truncation=truncation)
         for key, value in facts["rounding"].items():
