@@ -74,7 +74,7 @@ def save_checkpoint(
     """
     entries: dict[str, Array] = {"iteration": np.array(iteration), **arrays}
     if values is not None:
-        text = json.dumps({"format": FORMAT, "iteration": iteration, **values}, allow_nan=False)
+        text = json.dumps({"format": FORMAT, "iteration": iteration, **values})
         entries["state"] = np.frombuffer(text.encode(), np.uint8)
     path, new = folder / STATE_FILE, folder / _NEXT_FILE
     try:

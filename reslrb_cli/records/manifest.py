@@ -57,7 +57,7 @@ def commit_of(folder: Path) -> str | None:
         )  # fmt: skip
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    return done.stdout.strip() or None
 
 
 class Status(str, enum.Enum):

@@ -22,10 +22,11 @@ from kit import wait_for
 from reslrb_cli.cli import jobs, sweep
 from reslrb_cli.config.loader import load
 from reslrb_cli.records.manifest import PROGRAM, Status
-from reslrb_cli.records.sweeps import Combination, SweepPlan, read_sweep
+from reslrb_cli.records.sweeps import Combination, SweepPlan, read_sweep, run_name
 from reslrb_cli.report.page.sweep import best_records, ranked, run_records
 from reslrb_cli.report.sources import read_sweep_runs
-from reslrb_cli.runs.search import propose
+from reslrb_cli.runs import search
+from reslrb_cli.runs.search import Remaining, propose
 from reslrb_cli.runs.sweep import parse_vary
 
 RATE, SPP = "optimizer.learning_rate", "run.spp"
@@ -164,6 +165,23 @@ def test_a_trial_whose_settings_do_not_fit_has_failed(folder):
     assert {failure.code for failure in read_sweep(Path("s")).failures.values()} == {2}
     assert "the search ends after 5 trials: it finds no further combinations" in result.output
     assert "2 of 5 runs done, 3 failed" in result.output
+
+
+def test_another_result_may_bring_another_proposal(folder, monkeypatch):
+    """A search that finds nothing new asks again after the end of each run, and not before."""
+    tiny.done(*WORDS, "--trials", 2)
+    plan = read_sweep(Path("s"))
+    remaining, found = Remaining(Path("s"), replace(plan, search=replace(plan.search, trials=4))), []
+
+    def nothing_new(varied, sweep, values):
+        found.append(len(sweep.combinations))
+
+    monkeypatch.setattr(search, "propose", nothing_new)
+    assert [remaining.next(), remaining.next()] == [None, None]
+    assert found == [2]
+    remaining.end(run_name(*next(plan.runs)), 0, "finished")
+    assert remaining.next() is None
+    assert found == [2, 2]
 
 
 def test_the_loss_counts_if_true_values_are_unknown(folder, monkeypatch):
@@ -314,6 +332,24 @@ def test_runs_at_once_fit_into_memory(folder, monkeypatch, four_cores):
     monkeypatch.setattr(sweep, "call", together := Together(peak=2000))
     tiny.done("sweep", "tiny.yaml", "--vary", f"{SPP}=[1, 2, 3]", "-o", "u", "--jobs", "3")
     assert max(together.starts) == 2
+
+
+def test_memory_must_suffice_for_a_run_and_for_the_growth_of_the_others(monkeypatch, four_cores):
+    """The run at work may still grow by 1500, and the next one needs 2000."""
+    at_work, may_end = threading.Event(), threading.Event()
+
+    def work(slot):
+        slot.line, slot.peak, slot.resident = "1/5: ", 2000, 500
+        at_work.set()
+        return may_end.wait(60), "finished"
+
+    with jobs.Jobs(3, "llvm_ad_rgb") as at_once:
+        at_once.start("a", work)
+        assert at_work.wait(60)
+        for free, may in ((3499, False), (3500, True)):
+            monkeypatch.setattr(jobs, "free_bytes", lambda variant, free=free: free)
+            assert at_once.may_start() is may
+        may_end.set()
 
 
 def test_each_run_has_a_gpu(folder, monkeypatch, four_cores):

@@ -173,6 +173,7 @@ def test_no_path_leaves_the_folder(served, runs):
         assert SECRET not in text, path
     _, text = ask(served)
     assert text.count(">compare</a>") == 3  # the folders above are not listed
+    assert {run.name for run in serve.find_served(runs)} == {"a <b>", "b", "s", "s/rate=1-seed=0"}
 
 
 def test_nothing_is_changed(served, runs):

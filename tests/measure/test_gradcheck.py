@@ -183,13 +183,16 @@ def test_all_quantities_take_turns(monkeypatch: pytest.MonkeyPatch):
     assert said == ["1 of 5 seeds, 50 s", "2 of 5 seeds, 58 s", "4 of 5 seeds, 74 s"]
 
 
-@pytest.mark.parametrize(("budget_s", "counts"), [(0, {0}), (20, {0, 1}), (53, {1, 2}), (110, {8, 9}), (1e6, {16})])
-def test_a_budget_ends_early(budget_s: float, counts: set[int], monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("budget_s", "seeds", "counts"),
+    [(0, None, {0}), (20, None, {0, 1}), (53, None, {1, 2}), (110, None, {8, 9}), (1e6, None, {16}), (0, 5, {5})],
+)
+def test_a_budget_ends_early(budget_s: float, seeds: int | None, counts: set[int], monkeypatch: pytest.MonkeyPatch):
     """A sample that has started is finished. Comparisons with fewer than 8 seeds are unresolved and say how many they
-    had, and comparisons without any are named.
+    had, and comparisons without any are named. If no more seeds were asked for, the advice is to use more.
     """
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    made = pretended(CheckSettings(config, estimators_of("stack,event"), budget_s), monkeypatch)
+    made = pretended(CheckSettings(config, estimators_of("stack,event"), budget_s, seeds), monkeypatch)
     monkeypatch.setattr(made.participants, "shape", lambda key: (4,))
     monkeypatch.setattr(made.participants.case, "weights", np.zeros(4))
     made.participants.case.places = dict.fromkeys(made.participants.case.places, slice(0, 4))
@@ -204,7 +207,13 @@ def test_a_budget_ends_early(budget_s: float, counts: set[int], monkeypatch: pyt
             assert (record.verdict, record.message) == (Verdict.NOT_MEASURED, spent)
         elif record.seeds < 8 and record.kind is not Kind.EQUAL_SEEDS:
             assert (record.verdict, record.detectable is None) == (Verdict.UNRESOLVED, record.seeds == 1)
-            assert record.message == f"{record.seeds} of 16 seeds are too few to know the noise: {spent}"
+            few = (
+                "{} seeds are too few to know the noise: use at least 8"
+                if seeds
+                else "{} of 16 seeds are too few to know"
+            )
+            assert record.message.startswith(few.format(record.seeds))
+            assert seeds or record.message.endswith(f": {spent}")
         else:
             assert record.verdict in (Verdict.HOLDS, Verdict.FAILS)
     left = [record for record in records if record.seeds == 0]

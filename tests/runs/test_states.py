@@ -134,10 +134,12 @@ def test_the_manifest_of_a_resumed_run(run: Path, capsys: pytest.CaptureFixture[
     gone.wait()
     content = json.loads((run / "manifest.json").read_text())
     content |= {"process": content["process"] | {"pid": gone.pid}, "versions": content["versions"] | {"drjit": "0.1"}}
+    content |= {"started": "2026-01-02T03:04:05+00:00", "commit": "0123abc"}
     (run / "manifest.json").write_text(json.dumps(content))
     assert optimize("--resume", str(run), "--quiet") == 0
     after, now = json.loads((run / "manifest.json").read_text()), version("drjit")
     assert (after["process"]["pid"], after["process"]["locked"]) == (os.getpid(), True)
+    assert [after[key] for key in ("started", "commit")] == [content[key] for key in ("started", "commit")]
     assert after["resumed"][0]["versions"] == {"drjit": ["0.1", now]}
     line = f"versions have changed since the run began: drjit 0.1 then, {now} now; results may differ"
     assert line in capsys.readouterr().err

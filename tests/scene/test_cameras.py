@@ -12,7 +12,7 @@ from cli.tiny import CONFIG, write_experiment
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.scene.cameras import read_cameras, replace_sensors
+from reslrb_cli.scene.cameras import read_cameras, replace_sensors, sensor_ids
 from reslrb_cli.scene.files import files_of
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.xml.mend import mend
@@ -170,6 +170,15 @@ BAD = [
 def test_pinholes_of_every_name_are_read(folder, model):
     changes = {"camera_model": model, "is_fisheye": False, "distortion_params": [0.0, 0, 0, 0], "k2": 0, "p1": 0.0}
     assert len(read_cameras(write_nerf(folder, **changes))) == 2
+
+
+def test_images_of_one_name_have_sensors_of_their_own(folder):
+    path = write_nerf(folder)
+    frame = json.loads(path.read_text())["frames"][0]
+    frames = [{**frame, "file_path": f"{name}.exr"} for name in ("a_", "a", "left/a", "b", "left/b")]
+    description = read_description(folder / "scene.xml", {})
+    replace_sensors(description, read_cameras(write_nerf(folder, frames=frames)))
+    assert sensor_ids(description) == ["a_", "a", "a__", "b", "b_"]
 
 
 def test_ids_of_cameras_may_be_numbers_or_have_dashes(folder):
