@@ -328,7 +328,7 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the page of the extreme suite, made from the lines of its file. The page has a row for each case and a
     column for each estimator.
     """
-    from reslrb_cli.measure.extreme import CASES
+    from reslrb_cli.measure.scenes.catalogue import CASES
 
     origin, records = lines[0], [line for line in lines if "verdict" in line]
     z, distance = (max(record[limit] or 0.0 for record in records) for limit in ("z_max_limit", "relative_l2_limit"))

@@ -20,7 +20,7 @@ from benchmarks_page import main, read
 
 from paper import page as paper_page
 from reslrb_cli.cli import main as program
-from reslrb_cli.measure.extreme import CASES
+from reslrb_cli.measure.scenes.catalogue import CASES
 
 TINY = ("bench", "--values", "2", "--integrators", "reslrb:stack", "--rounds", "1", "--set", "scene.options.size=8",
         "--set", "run.spp=1")  # fmt: skip

@@ -393,8 +393,7 @@ def check_estimator(
         from reslrb_cli.config.base import is_code
         from reslrb_cli.estimators import ESTIMATORS, check_own
         from reslrb_cli.integrators.own import load_estimator
-        from reslrb_cli.measure.extreme import CASES
-        from reslrb_cli.measure.extreme.suite import run_case
+        from reslrb_cli.measure.extreme import CASES, run_case
 
         unknown = [name for name in scenes if name not in CASES]
         if unknown:

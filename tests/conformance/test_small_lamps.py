@@ -17,9 +17,10 @@ from conformance.test_kernels import Kernels
 from measure.faults import Fault, plant, planted
 from turns import a_few
 
-from reslrb_cli.measure.extreme.suite import Exact, ExtremeCase, Stock, run_case
+from reslrb_cli.measure.extreme import run_case
 from reslrb_cli.measure.gradients import Case, integrator, relative
 from reslrb_cli.measure.scenes.analytic import RADIANCE, speck_in_view
+from reslrb_cli.measure.scenes.case import SceneCase, exact
 from reslrb_cli.measure.scenes.small import camera, diffuse, load, rgb, room, transform
 from reslrb_cli.scene import graph
 
@@ -60,12 +61,11 @@ def through_a_lens() -> dict[str, Any]:
 
 
 CASES = {
-    "third": ExtremeCase("third", "", lambda: third().scene(), (KEY,), Exact(third), "ptracer",
-                         options={"max_depth": 1}),
-    "two": ExtremeCase("two", "", two, SPECKS, Stock("ptracer"), "ptracer"),
+    "third": exact("third", "", third, {"radiance": KEY}, 1, image="ptracer"),
+    "two": SceneCase("two", "", two, SPECKS, image="ptracer"),
     # There is no stock image: `ptracer` loses light where a mask is seen, and `path` hardly ever finds the specks.
-    "veiled": ExtremeCase("veiled", "", veiled, SPECKS, Stock("ptracer"), ""),
-    "lens": ExtremeCase("lens", "", through_a_lens, SPECKS, Stock("ptracer"), "ptracer", spp=256),
+    "veiled": SceneCase("veiled", "", veiled, SPECKS, image=""),
+    "lens": SceneCase("lens", "", through_a_lens, SPECKS, image="ptracer", spp=256),
 }  # fmt: skip
 
 

@@ -19,12 +19,12 @@ import pytest
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators.stack import Stack
-from reslrb_cli.measure.extreme import CASES
-from reslrb_cli.measure.extreme.suite import run_case
+from reslrb_cli.measure.extreme import run_case
 from reslrb_cli.measure.gradcheck import Gradcheck
 from reslrb_cli.measure.methods import NamedIntegrator, parse_checked
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.measure.scenes import small
+from reslrb_cli.measure.scenes.catalogue import CASES
 from reslrb_cli.records.measurements import GradcheckRecord
 
 Check = Callable[[], Iterable[GradcheckRecord]]

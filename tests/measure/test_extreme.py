@@ -14,10 +14,11 @@ import pytest
 from reslrb_cli.estimators.base import Pass
 from reslrb_cli.estimators.gather import Gathering, Taking
 from reslrb_cli.integrators.protocol import Job
+from reslrb_cli.measure import extreme
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, divisions, overall, parts
-from reslrb_cli.measure.extreme import CASES, LISTED, suite
-from reslrb_cli.measure.extreme.suite import MOST_CASES, WAYS, run_case
+from reslrb_cli.measure.extreme import MOST_CASES, WAYS, run_case
 from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.scenes.catalogue import CASES, TAGGED
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Verdict
 
 #: The case of the default suite: a lamp of which no point can be drawn. test_replay.py has values that are not finite,
@@ -32,7 +33,7 @@ def failures(records: Iterable[GradcheckRecord]) -> list[str]:
 
 def test_names():
     assert 40 <= len(CASES) <= MOST_CASES
-    assert len(CASES) == len(LISTED), "no two have the same"
+    assert len(CASES) == sum(map(len, TAGGED.values())), "no two have the same"
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, name: str, estimators: Iterable[str] | None) -> list[GradcheckRecord]:
@@ -45,7 +46,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, name: str, estimators: Iterable[str
         made.append((family, sizes if shape is None else sizes + overall(ours).shape[1]))
         return compare_expectations(ours, reference, family, **options)
 
-    monkeypatch.setattr(suite, "compare_expectations", compare)
+    monkeypatch.setattr(extreme, "compare_expectations", compare)
     records = list(run_case(CASES[name], estimators))
     [family] = {family for family, _ in made}
     assert family == Family(len(made), sum(entries for _, entries in made), ALPHA / MOST_CASES)
@@ -63,12 +64,12 @@ def test_images_with_heavy_tails_are_open_only_for_a_reason():
     """One seed has a firefly, and the other noise hides no deviation."""
     random, case, family = np.random.default_rng(1), CASES["furnace"], Family(10, 1000)
     ours, stock = (1 + 0.01 * random.normal(size=(16, 8, 8, 3)) for _ in range(2))
-    assert suite._images(case, ours, stock, family).verdict is Verdict.HOLDS
+    assert extreme._images(case, ours, stock, family).verdict is Verdict.HOLDS
     ours[3] += 50
-    found = suite._images(case, ours, stock, family)
+    found = extreme._images(case, ours, stock, family)
     assert (found.verdict, found.message[:13]) == (Verdict.FAILS, "heavy_tailed:")
-    known = replace(case, open_ended={suite.IMAGE: "a reason"})
-    found = suite._images(known, ours, stock, family)
+    known = replace(case, open_ended={extreme.IMAGE: "a reason"})
+    found = extreme._images(known, ours, stock, family)
     assert (found.verdict, found.message) == (Verdict.HEAVY_TAILED, "a reason")
 
 

@@ -21,9 +21,9 @@ from optimization.deciding import decision, operations
 from reslrb_cli.config.loader import load, loads
 from reslrb_cli.config.schema import Config
 from reslrb_cli.integrators.step import render_image
-from reslrb_cli.measure.extreme import CASES
-from reslrb_cli.measure.extreme.suite import ExtremeCase
 from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.scenes.case import SceneCase
+from reslrb_cli.measure.scenes.catalogue import CASES
 from reslrb_cli.measure.scenes.small import load as load_scene
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.optimization.autotune.race import Finding, Turns
@@ -61,7 +61,7 @@ def alone() -> None:
     gc.collect()
 
 
-def decided(config: Config, case: ExtremeCase | None) -> Problem:
+def decided(config: Config, case: SceneCase | None) -> Problem:
     """Return the problem, in the scene of a case if one is given, after all decisions by measurement."""
     problem = assemble_scene(config, None if case is None else load_scene(case.scene()))
     check_step(problem)
@@ -69,7 +69,7 @@ def decided(config: Config, case: ExtremeCase | None) -> Problem:
     return DECIDE["decide"](problem, lambda line: None)
 
 
-def extreme(case: ExtremeCase, folder: Path) -> str:
+def extreme(case: SceneCase, folder: Path) -> str:
     """Return a configuration for a case. The configuration recovers reflectances from an image of the case, which this
     function writes.
     """
@@ -87,7 +87,7 @@ run: {{spp: {spp}, iterations: 200}}
 """
 
 
-def config_of(name: str, case: ExtremeCase | None, folder: Path, *settings: str) -> Config:
+def config_of(name: str, case: SceneCase | None, folder: Path, *settings: str) -> Config:
     """Return a shipped configuration by its name, or the configuration of a case of the extreme suite."""
     if case is not None:
         return loads(extreme(case, folder), Path(f"{case.name}.yaml"), [*settings])

@@ -17,6 +17,8 @@ from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.graph import SceneGraph
 
 Array = NDArray[np.float64]
+#: Sets parameters of a scene from numbers, by name.
+Place = Callable[[mi.SceneParameters, Mapping[str, Any]], None]
 
 #: Waves of a surface: wave vectors, phases, and amplitudes with a mean slope of about 0.1.
 WAVES = (((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.012), ((7.9, -4.6), 4.1, 0.0062), ((2.2, -8.8), 2.7, 0.0055))
@@ -27,18 +29,24 @@ def waves(x: Array, z: Array) -> Array:
     return sum((a * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, a in WAVES), np.zeros_like(x))
 
 
-def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array) -> Any:
-    """A mesh of vertices (V, 3) and triangles (F, 3) with interpolated normals and texture coordinates (V, 2)."""
+def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = None, normals: np.ndarray | bool = True,
+         name: str = "mesh", **things: Any) -> Any:  # fmt: skip
+    """A mesh of vertices (V, 3) and triangles (F, 3), with texture coordinates (V, 2) if given.
+
+    `normals` are vertex normals (V, 3). If `normals` is true, Mitsuba interpolates them. If false, faces are flat.
+    `things` are added to the mesh's dictionary, for example an emitter.
+    """
     properties = mi.Properties()
-    properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    shape = mi.Mesh("mesh", len(positions), len(faces), has_vertex_normals=True, has_vertex_texcoords=True,
-                    props=properties)  # fmt: skip
+    for key, thing in {"bsdf": bsdf, **things}.items():
+        properties[key] = mi.load_dict(thing)
+    shape = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=normals is not False,
+                    has_vertex_texcoords=texcoords is not None)  # fmt: skip
     params = mi.traverse(shape)
-    params["vertex_positions"] = np.ravel(positions).astype(np.float32)
+    for part, value in (("positions", positions), ("normals", normals), ("texcoords", texcoords)):
+        if isinstance(value, np.ndarray):
+            params[f"vertex_{part}"] = np.ravel(value).astype(np.float32)
     params["faces"] = np.ravel(faces).astype(np.uint32)
-    params["vertex_texcoords"] = np.ravel(texcoords).astype(np.float32)
     params.update()
-    shape.recompute_vertex_normals()
     return shape
 
 
@@ -160,37 +168,41 @@ Move = Displacement | Pose | Number
 
 
 @dataclass
-class Displaced:
-    """The scene values that `moves` change. Replaces a `Selection` in a `Case`. AMPLITUDES has the
-    amplitudes of all moves.
+class Latents:
+    """Numbers that determine a scene. Replaces a `Selection` in a `Case`.
+
+    `start` has a number or a row of numbers for each name, or None for a key of the scene, which is set directly.
+    `place(params, latents)` gets the numbers as Dr.Jit arrays. It sets parameters of the scene, which follow the
+    derivatives of these numbers.
     """
 
     scene: mi.Scene
-    moves: Sequence[Move]
+    start: Mapping[str, Any]
+    place: Place | None = None
     params: mi.SceneParameters = field(init=False)
 
     def __post_init__(self) -> None:
         self.params = mi.traverse(self.scene)
-        self._amplitudes = dr.opaque(mi.Float, 0, sum(move.size for move in self.moves))
-        self._initial = {move.key: _copy(self.params[move.key]) for move in self.moves}
+        self._values = {
+            name: own_memory(mi.Float, np.atleast_1d(np.float32(value)))
+            for name, value in self.start.items() if value is not None
+        }  # fmt: skip
         self._meshes = [shape for shape in SceneGraph.of(self.scene).shapes() if shape.is_mesh()]
+        self.hand_over({})
 
     def value(self, key: str) -> Any:
-        """Return the amplitudes (K,)."""
-        return self._amplitudes if key == AMPLITUDES else self.params[key]
+        """Return the current value of a latent, or of a parameter of the scene."""
+        return self._values[key] if key in self._values else self.params[key]
 
     def hand_over(self, values: Mapping[str, Any]) -> None:
-        """Set the amplitudes, and apply the moves."""
-        at, moved = 0, []
-        self._amplitudes = values[AMPLITUDES]
-        for move in self.moves:
-            own = [dr.gather(mi.Float, self._amplitudes, at + k) for k in range(move.size)]
-            at += move.size
-            moved.append(move.value(self._initial[move.key], own))
-            self.params[move.key] = moved[-1]
+        """Set latents, and place the scene's objects."""
+        for key, value in values.items():
+            (self._values if key in self._values else self.params)[key] = value
+        if self.place is not None:
+            self.place(self.params, self._values)
         self.params.update()
         # Normals follow the positions now; otherwise the next tracing would compute them for each ray.
-        dr.eval(moved, [mesh.vertex_normals_buffer() for mesh in self._meshes])
+        dr.eval([value for _, value in self.params.items()], [mesh.vertex_normals_buffer() for mesh in self._meshes])
 
     def collect(self) -> None:
         """Do nothing: within one step, gradients and tangents propagate by themselves."""
@@ -203,7 +215,18 @@ def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Ca
     scene's `moves`.
     """
     scene = load(description)
-    case = Case(scene, [AMPLITUDES], values=Displaced(scene, moves(scene)))
+    listed, params = moves(scene), mi.traverse(scene)
+    initial = {move.key: _copy(params[move.key]) for move in listed}
+
+    def place(params: mi.SceneParameters, latents: Mapping[str, Any]) -> None:
+        at = 0
+        for move in listed:
+            own = [dr.gather(mi.Float, latents[AMPLITUDES], at + k) for k in range(move.size)]
+            at += move.size
+            params[move.key] = move.value(initial[move.key], own)
+
+    start = {AMPLITUDES: np.zeros(sum(move.size for move in listed))}
+    case = Case(scene, start, values=Latents(scene, start, place))
     case.weigh(smooth_weights(*case.weights.shape))
     return case
 

@@ -81,9 +81,15 @@ def rgb(*value: float) -> dict:
     return {"type": "rgb", "value": list(value)}
 
 
-def diffuse(*value: float) -> dict:
-    """A diffuse BSDF of this colour."""
-    return {"type": "diffuse", "reflectance": rgb(*value)}
+def diffuse(*reflectance: Any) -> dict:
+    """A diffuse BSDF of this colour, or with this texture."""
+    textured = len(reflectance) == 1
+    return {"type": "diffuse", "reflectance": reflectance[0] if textured else rgb(*reflectance)}
+
+
+def matte(*reflectance: Any) -> dict:
+    """A `diffuse` BSDF on both sides."""
+    return {"type": "twosided", "bsdf": diffuse(*reflectance)}
 
 
 def glass(ior: float = 1.5, outside: float = 1.0, **options: Any) -> dict:
@@ -97,9 +103,9 @@ def transform(**steps: Any) -> Any:
     for name, value in steps.items():
         if name == "rotate":
             axis, angle = value
-            result = result @ mi.ScalarTransform4f().rotate(np.divide(axis, np.linalg.norm(axis)).tolist(), angle)
+            result = result.rotate(np.divide(axis, np.linalg.norm(axis)).tolist(), angle)
         else:
-            result = result @ getattr(mi.ScalarTransform4f(), name)(value)
+            result = getattr(result, name)(value)
     return result
 
 
@@ -111,6 +117,11 @@ def look_at(origin: Sequence[float], target: Sequence[float], up: Sequence[float
 def rectangle(bsdf: dict, to_world: Any = None, **place: Any) -> dict:
     """A square of side 2 that faces along z, transformed by `to_world` or by the arguments of `transform`."""
     return {"type": "rectangle", "bsdf": bsdf, "to_world": transform(**place) if to_world is None else to_world}
+
+
+def sphere(bsdf: dict, center: Sequence[float], radius: float) -> dict:
+    """A sphere."""
+    return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": bsdf}
 
 
 def lit_square(radiance: dict, to_world: Any = None, kind: str = "area", **place: Any) -> dict:
@@ -144,9 +155,9 @@ def room(**changes: Any) -> dict:
     scene = {
         "type": "scene",
         "camera": camera(),
-        "floor": {"type": "twosided", "bsdf": diffuse(0.7, 0.5, 0.6)},
-        "wall": {"type": "twosided", "bsdf": diffuse(0.5, 0.7, 0.4)},
-        "side": {"type": "twosided", "bsdf": diffuse(0.6, 0.4, 0.7)},
+        "floor": matte(0.7, 0.5, 0.6),
+        "wall": matte(0.5, 0.7, 0.4),
+        "side": matte(0.6, 0.4, 0.7),
         "floor_shape": rectangle({"type": "ref", "id": "floor"}, translate=[0, -1, 0], rotate=([1, 0, 0], -90)),
         "wall_shape": rectangle({"type": "ref", "id": "wall"}, translate=[0, 0, -1]),
         "side_shape": rectangle({"type": "ref", "id": "side"}, translate=[-1, 0, 0], rotate=([0, 1, 0], 90)),
