@@ -128,8 +128,7 @@ def _run_way(case: SceneCase, setup: Case, members: Mapping[str, str], family: F
     # Refused values of dL/dI count as zero, and references never get them.
     setup.weights = type(setup.weights)(np.where(np.isfinite(weights), weights, 0))
     reference = case.source.samples(case, setup)
-    attached = {} if case.moves is None else {"attached": True}
-    walk_ad = integrator("walk_ad", **{**case.options, **case.ours, **attached})
+    walk_ad = integrator("walk_ad", **case.own | ({} if case.moves is None else {"attached": True}))
     naive = setup.gradients(walk_ad, seeds_of(case.seeds), case.spp) if case.naive else None
     stock = None
     if case.image:
@@ -164,8 +163,7 @@ def _steps(case: SceneCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndar
         refused.append(int(result.refused.count[0]))
 
     # Naive AD follows everywhere: at equal seeds, it has the same derivatives as an integrator that follows everywhere.
-    ours = {"attached_sampling": "follow"} | dict(case.ours)
-    tracer = integrator("reslrb", **case.options, **ours, estimator=name)
+    tracer = integrator("reslrb", **{"attached_sampling": "follow"} | case.own, estimator=name)
     gradients = setup.gradients(tracer, seeds_of(case.seeds), case.spp, step=step)
     return gradients, np.stack(images), refused
 

@@ -11,9 +11,7 @@ import numpy as np
 from conformance.moving import (
     GLASS,
     WHITE,
-    Latents,
     Moving,
-    Place,
     beam,
     camera,
     enclosed,
@@ -21,13 +19,13 @@ from conformance.moving import (
     rippled,
     sheet,
     textured,
-    transform,
     turned,
     under_glass,
 )
 from measure.faults import Fault
 
-from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb
+from reslrb_cli.measure.scenes.moving import Latents, Place
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
 
 # The cases of test_attached.py: the scene, its moving parts, and the reference of the comparison.
 
@@ -111,7 +109,7 @@ def mapped() -> dict[str, Any]:
 
 def stretch_slab(params: mi.SceneParameters, latents: Latents) -> None:
     """Multiply the slab's ripples by a number, and lift the slab."""
-    heights, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
+    heights, rest = (mi.Float(rippled(2.0, 12, ripples)[0].astype(np.float32).ravel()) for ripples in (1.0, 0.0))
     up = np.tile(np.array([0, 1, 0], np.float32), 13 * 13)
     params["slab.vertex_positions"] = rest + (heights - rest) * latents["size"] + mi.Float(up) * latents["lift"]
 

@@ -30,7 +30,7 @@ def guided(name: str, steps: int, **options: Any) -> tuple[Case, Any, Any]:
     """
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
-    own = case.options | case.both | options
+    own = case.own | options
     ours = integrator("reslrb", **{"estimator": "stack", **own}, guiding="on")
     for seed in range(steps):
         learn(scene, ours, seed)
@@ -103,7 +103,7 @@ def aim_everywhere(patch: pytest.MonkeyPatch) -> None:
 def both(name: str, **options: Any) -> tuple[Case, Any, Any]:
     """Return a case, an integrator with low-discrepancy numbers, and an integrator with independent numbers."""
     case = BY_NAME[name]
-    own = {"estimator": "stack"} | case.options | case.both | options
+    own = {"estimator": "stack"} | case.own | options
     return Case(case.scene(), case.keys), integrator("reslrb", **own, **LOW_DISCREPANCY), integrator("reslrb", **own)
 
 

@@ -17,9 +17,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from conformance.moving import Latents, Moving, mesh, turned
+from conformance.moving import Moving, turned
 
 from reslrb_cli.measure.gradients import integrator, seeds, smooth_weights
+from reslrb_cli.measure.scenes.moving import Latents, mesh
 from reslrb_cli.measure.scenes.small import diffuse, lit_square, look_at, rectangle, rgb, transform
 
 #: Finite differences (N, K) by the name of a case.

@@ -13,8 +13,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from conformance.moving import Latents, Moving, camera, flat, sheet
+from conformance.moving import Moving, camera, flat, sheet
 
+from reslrb_cli.measure.scenes.moving import Latents
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
 
 PIVOT = (0.1, 4.5, 0.2)

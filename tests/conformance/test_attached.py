@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.attached_cases import CASES, FAULTS, AttachedCase
-from conformance.moving import WHITE, Moving, Place, beam, camera, enclosed, flat, rippled, sheet, under_glass
+from conformance.moving import WHITE, Moving, beam, camera, enclosed, flat, rippled, sheet, under_glass
 from measure.faults import Fault, plant, planted
 from measure.moving_light import SCENES
 from turns import taking_turns
@@ -20,6 +20,7 @@ from reslrb_cli import register
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.measure.gradients import integrator, relative
+from reslrb_cli.measure.scenes.moving import Place
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, rgb, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -172,7 +173,7 @@ class Script:
 
     def render(self, **plugin: Any) -> tuple[mi.Float, mi.TensorXf]:
         """Return the amplitude, which tracks derivatives, and the image."""
-        positions, rest = (mi.Float(rippled(2.0, 12, ripples).astype(np.float32).ravel()) for ripples in (1.0, 0.0))
+        positions, rest = (mi.Float(rippled(2.0, 12, ripples)[0].astype(np.float32).ravel()) for ripples in (1.0, 0.0))
         amplitude = mi.Float(1)
         dr.enable_grad(amplitude)
         self.params["slab.vertex_positions"] = rest + (positions - rest) * amplitude

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from agreement import Agreement, compare
 from conformance.edge_cases import ABOVE, LAMPS, SIZE, _camera, _open
-from conformance.moving import Latents, Moving, turned
+from conformance.moving import Moving, turned
 from measure.faults import Fault, assert_found, planted
 from turns import a_few
 
@@ -25,6 +25,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import integrator, relative, seeds, smooth_weights
+from reslrb_cli.measure.scenes.moving import Latents
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lit_square, look_at, rectangle, rgb, transform
 
 pytestmark = pytest.mark.usefixtures("registers")

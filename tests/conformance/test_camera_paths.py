@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare, is_same
-from conformance.gradient_cases import CASES, GradientCase
+from conformance.gradient_cases import CASES
 from conformance.scenes import (
     RED,
     agreement,
@@ -38,6 +38,8 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import interface_of, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.scenes.case import SceneCase
+from reslrb_cli.measure.scenes.catalogue import PRB
 from reslrb_cli.records.clock import peak_mib, reset_peak
 from reslrb_cli.transport.camera import one_of_group
 from reslrb_cli.transport.pixel_shares import EVEN, MOST_SLOTS, PixelShares
@@ -308,8 +310,8 @@ def test_short_paths(depth: int):
 BOTH = [case for case in CASES if case.name not in ("texture_prb", "directionalarea")]
 
 
-def options_of(case: GradientCase, paths: str, **more: Any) -> dict[str, Any]:
-    return {**case.both, "estimator": "stack", "paths": paths, **more}
+def options_of(case: SceneCase, paths: str, **more: Any) -> dict[str, Any]:
+    return {**case.options, "estimator": "stack", "paths": paths, **more}
 
 
 #: Ways of a step: dL/dI becomes known after the image, or before it, in one traversal; with a small stack (one vertex)
@@ -335,9 +337,9 @@ SOME = {
           for case in BOTH for paths in ("camera", "both")),
     ],
 )  # fmt: skip
-def test_gradients_equal_naive_ad(case: GradientCase, paths: str, steps: tuple[str, ...]):
+def test_gradients_equal_naive_ad(case: SceneCase, paths: str, steps: tuple[str, ...]):
     scene = Case(case.scene(), case.keys)
-    reference = scene.gradient(integrator("walk_ad", **case.both, paths=paths), 5, case.spp)
+    reference = scene.gradient(integrator("walk_ad", **case.options, paths=paths), 5, case.spp)
     for name in steps:
         more, known = STEPS[name]
         step = {"step": scene.known_step} if known else {}
@@ -353,7 +355,7 @@ def test_forward_mode_equals_naive_ad(name: str, paths: str):
     case = next(case for case in CASES if case.name == name)
     scene = Case(case.scene(), case.keys)
     tangent = forward(scene, plugin("reslrb", **options_of(case, paths)), 3, 16)
-    naive = forward(scene, plugin("walk_ad", **case.both, paths=paths), 3, 16)
+    naive = forward(scene, plugin("walk_ad", **case.options, paths=paths), 3, 16)
     assert np.abs(naive).max() > 0
     assert relative(tangent, naive) < 1e-5
 
@@ -384,10 +386,10 @@ def test_forward_mode_sees_no_light_from_hidden_lamps():
     assert relative(tangent, forward(scene, plugin("walk_ad", **options), 3, 16)) < 1e-5
 
 
-@pytest.mark.parametrize("case", a_few([case for case in BOTH if case.reference == "prb"], ()))
-def test_gradients_equal_prb(case: GradientCase):
+@pytest.mark.parametrize("case", a_few([case for case in BOTH if case.source == PRB], ()))
+def test_gradients_equal_prb(case: SceneCase):
     scene = Case(case.scene(), case.keys)
-    reference = scene.gradients(integrator("prb", **case.both), seeds(16, 1), case.spp)
+    reference = scene.gradients(integrator("prb", **case.options), seeds(16, 1), case.spp)
     for paths in ("camera", "both"):
         ours = scene.gradients(integrator("reslrb", **options_of(case, paths)), seeds(16), case.spp)
         assert compare(ours, reference, block=None), paths
@@ -398,7 +400,7 @@ NO_CAUSTICS = [case for case in BOTH if case.name not in ("glass", "mirror")]
 
 
 @pytest.mark.parametrize("case", a_few(NO_CAUSTICS, ()))
-def test_both_has_the_expectation_of_camera_paths(case: GradientCase):
+def test_both_has_the_expectation_of_camera_paths(case: SceneCase):
     scene = Case(case.scene(), case.keys)
     ours, reference = (
         scene.gradients(integrator("reslrb", **options_of(case, paths)), seeds(16, at), case.spp)
@@ -484,7 +486,7 @@ def test_lamps_whose_rays_mitsuba_cannot_sample(combined: None):
 def test_moving_light_uses_light_paths_in_its_image_too():
     case = next(case for case in CASES if case.name == "gaussian")
     scene = Case(case.scene(), case.keys)
-    work = interface_of(integrator("reslrb", estimator="stack", paths="both", attached=True, **case.both))
+    work = interface_of(integrator("reslrb", estimator="stack", paths="both", attached=True, **case.options))
     job = Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(3), 4, scene.params)
     leaves = scene.leaves()
     assert work.plan(scene.scene, job.sensor, scene.params).paths == "light"

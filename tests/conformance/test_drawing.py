@@ -96,7 +96,7 @@ def test_means_over_many_seeds_agree(name: str, guiding: str) -> None:
         _, ours, _ = guided(name, 4, **LOW_DISCREPANCY)
     found, case = samples(scene, ours, 200), BY_NAME[name]
     against = compare(found, samples(scene, plain, 200, 1), block=None)
-    stock = scene.gradients(integrator(case.reference, **case.both), seeds(200, 2), case.spp)
+    stock = scene.gradients(integrator(case.source.name, **case.options), seeds(200, 2), case.spp)
     independent = compare(found[:, : stock.shape[1]], stock, block=None)
     print(name, guiding, against, independent, sep="\n")
     assert against

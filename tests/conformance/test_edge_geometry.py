@@ -298,7 +298,7 @@ def test_edges_whose_chain_ends_early_do_not_count(monkeypatch: pytest.MonkeyPat
 
 def faces_towards_the_sensor(moving: Moving, **shifts: float) -> np.ndarray:
     """Return which faces of the shape have the sensor on their outer side, with some of the latents shifted."""
-    moving.set({name: mi.Float([float(value + shifts.get(name, 0))]) for name, value in moving.start.items()})
+    moving.set({name: value + shifts.get(name, 0) for name, value in moving.start.items()})
     [shape] = [shape for shape in moving.loaded.shapes() if shape.id() == "shape"]
     view = np.array(moving.loaded.sensors()[0].world_transform() @ mi.Point3f(0)).ravel()
     corners = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)[np.array(shape.faces_buffer()).reshape(-1, 3)]

@@ -12,13 +12,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conformance import gradient_cases
-from conformance.gradient_cases import CASES, GradientCase
+from conformance.gradient_cases import CASES, case
 from turns import a_few, taking_turns
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators import freezing
 from reslrb_cli.integrators.step import render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative
+from reslrb_cli.measure.scenes.case import SceneCase
+from reslrb_cli.measure.scenes.catalogue import PRB
 from reslrb_cli.measure.scenes.small import camera
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -36,13 +38,13 @@ KINDS = {
 }
 
 
-def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list[np.ndarray], list[dict[str, int]]]:
+def gradients(case: SceneCase, adjoint: str, **options: object) -> tuple[list[np.ndarray], list[dict[str, int]]]:
     """Return the gradients of four steps, and the counts of recordings after each step. Seed and parameters change
     between the steps.
     """
     scene = Case(case.scene(), case.keys)
-    own = {key: value for key, value in case.options.items() if key != "samples_per_pass"}
-    chosen = integrator("reslrb", **{**case.both, **own, **options})
+    own = {key: value for key, value in case.ours.items() if key != "samples_per_pass"}
+    chosen = integrator("reslrb", **{**case.options, **own, **options})
     found, counts = [], []
     for step in range(4):
         factor = 1 - 0.1 * step
@@ -53,7 +55,7 @@ def gradients(case: GradientCase, adjoint: str, **options: object) -> tuple[list
 
 
 @taking_turns("case", [case for case in CASES if case.name not in NOT_RECORDED], "estimator", ESTIMATORS, FEWEST)
-def test_a_recorded_step_equals_the_step(case: GradientCase, estimator: str) -> None:
+def test_a_recorded_step_equals_the_step(case: SceneCase, estimator: str) -> None:
     """Case and estimator determine the kind of dL/dI."""
     adjoint = list(KINDS)[(ESTIMATORS.index(estimator) + len(case.name)) % len(KINDS)]
     expected, none = gradients(case, adjoint, estimator=estimator, freeze=False)
@@ -75,8 +77,8 @@ def _software_texture() -> dict:
 
 #: Scenes whose recordings ended the process with CUDA.
 TEXTURES = {
-    "sky": GradientCase("sky", BY_NAME["envmap"].scene, ("floor.brdf_0.reflectance.value",), "prb"),
-    "software": GradientCase("software", _software_texture, ("floor.reflectance.data",), "prb"),
+    "sky": case("sky", BY_NAME["envmap"].scene, ("floor.brdf_0.reflectance.value",), PRB),
+    "software": case("software", _software_texture, ("floor.reflectance.data",), PRB),
 }
 
 

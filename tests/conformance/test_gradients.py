@@ -17,10 +17,8 @@ from conformance.gradient_cases import (
     _IN_VIEW,
     AT_EQUAL_SEEDS,
     CASES,
-    FLOOR,
     IN_EXPECTATION,
-    GradientCase,
-    _mask,
+    TEXELS,
     black_pane,
     floor,
 )
@@ -31,6 +29,8 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.scenes.case import Differences, SceneCase
+from reslrb_cli.measure.scenes.catalogue import veiled
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform
 from reslrb_cli.scene.upsampling import DARKEST
 
@@ -54,15 +54,15 @@ BY_ADJOINT = {
 }
 
 
-def estimator(case: GradientCase, name: str, options: dict):
+def estimator(case: SceneCase, name: str, options: dict):
     """Return the integrator of a case with this estimator."""
-    return integrator("reslrb", **case.both | case.options | {"estimator": name} | options)
+    return integrator("reslrb", **case.own | {"estimator": name} | options)
 
 
 @taking_turns("case", CASES, "adjoint", ("correlated", "independent"), AT_EQUAL_SEEDS)
-def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
+def test_exact_estimators_equal_naive_ad(case: SceneCase, adjoint: str):
     scene = Case(case.scene(), case.keys)
-    reference = scene.gradient(integrator("walk_ad", **case.both | case.options), 5, case.spp, adjoint=adjoint)
+    reference = scene.gradient(integrator("walk_ad", **case.own), 5, case.spp, adjoint=adjoint)
     for name, options in EXACT.items():
         ours = scene.gradient(estimator(case, name, options), 5, case.spp, adjoint=adjoint)
         error = relative(ours, reference)
@@ -70,7 +70,7 @@ def test_exact_estimators_equal_naive_ad(case: GradientCase, adjoint: str):
         assert error < scene.rounding(), f"{name}, {adjoint}: {error:.1e}"
 
 
-def agree(case: GradientCase, count: int, candidates: dict[str, dict], adjoint: str) -> None:
+def agree(case: SceneCase, count: int, candidates: dict[str, dict], adjoint: str) -> None:
     """Compare each candidate with `gather` at other seeds, over `count` seeds each."""
     scene = Case(case.scene(), case.keys)
     reference = scene.gradients(estimator(case, "gather", {}), seeds(count, 1), case.spp, adjoint=adjoint)
@@ -87,7 +87,7 @@ FEW = ("texture", "roulette", "crop", "glass", "mask_texture_in_view", "area_tex
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", a_few(CASES, ["texture"]))
-def test_random_estimators_agree(case: GradientCase):
+def test_random_estimators_agree(case: SceneCase):
     count = 16 if case.name == "texture" else 200 if case.name in FEW else 40
     agree(case, count, RANDOM, "correlated")
     agree(case, count, BY_ADJOINT, "independent")
@@ -112,20 +112,21 @@ def test_without_light_paths_the_gradient_is_zero(name: str, max_depth: int):
 RESOLUTION = 0.1
 
 
-def agreement(case: GradientCase, count: int) -> Agreement:
+def agreement(case: SceneCase, count: int) -> Agreement:
     """Compare gradients with the case's reference over `count` seeds each."""
     scene = Case(case.scene(), case.keys)
-    ours = scene.gradients(integrator("reslrb", **case.both | case.options), seeds(count), case.spp)
-    if case.reference == "fd":
-        image = integrator("reslrb", **case.both)
+    ours = scene.gradients(integrator("reslrb", **case.own), seeds(count), case.spp)
+    source = case.source
+    if isinstance(source, Differences):
+        image = integrator("reslrb", **case.options)
         directions = scene.directions(max(2, count // 16))
         ours = ours @ directions.T
         reference = np.array([
-            [scene.difference(image, direction, seed, case.spp, case.step, case.sides) for direction in directions]
+            [scene.difference(image, direction, seed, case.spp, source.step, source.sides) for direction in directions]
             for seed in seeds(count, 1)
         ])  # fmt: skip
     else:
-        reference = scene.gradients(integrator(case.reference, **case.both), seeds(count, 1), case.spp)
+        reference = scene.gradients(integrator(source.name, **case.options), seeds(count, 1), case.spp)
     size = np.linalg.norm(reference.mean(0))
     noise = np.linalg.norm(np.hypot(ours.std(0), reference.std(0))) / np.sqrt(count)
     assert noise < RESOLUTION * size, f"{case.name}: standard error {noise / size:.1%} of the gradient"
@@ -133,9 +134,9 @@ def agreement(case: GradientCase, count: int) -> Agreement:
 
 
 @pytest.mark.parametrize("case", a_few(CASES, IN_EXPECTATION))
-def test_gradient(case: GradientCase):
+def test_gradient(case: SceneCase):
     result = agreement(case, 16 if case.name in IN_EXPECTATION else 64)
-    print(case.name, case.reference, result)
+    print(case.name, case.source, result)
     assert result
 
 
@@ -157,7 +158,7 @@ SAME_PATHS = ("texture", "gaussian", "crop", "rgba", "thin_lens", "twosided", "m
 def test_walk_ad_equals_ptracer(name: str):
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
-    options = case.both | {"hide_emitters": True}
+    options = {**case.options, "hide_emitters": True}
     ours = scene.gradient(integrator("walk_ad", **options), 3, 64)
     assert relative(ours, scene.gradient(integrator("ptracer", **options), 3, 64)) < scene.rounding()
 
@@ -183,7 +184,7 @@ QUICK = ("roulette", "glass", "mask_texture_in_view", "visible_lamp")
 @pytest.mark.parametrize("name", a_few([n for n in BY_NAME if n != "texture_prb"], QUICK))
 def test_forward_mode_equals_walk_ad(name: str):
     case = BY_NAME[name]
-    scene, options = Case(case.scene(), case.keys), case.both | case.options
+    scene, options = Case(case.scene(), case.keys), case.own
     tangent = forward(scene, plugin("reslrb", **options), 3, 32)
     naive = forward(scene, plugin("walk_ad", **options), 3, 32)
     assert np.abs(naive).max() > 0
@@ -234,17 +235,17 @@ CLIPPED = "Mitsuba clips opacities and weights to [0, 1], and Dr.Jit's clip has 
 NOT_SAMPLED = "what has a probability of zero is not sampled, here light that passes an opaque mask"
 
 ZERO_CASES = [
-    ZeroCase("texel_zero_in_one_channel", lambda: floor(matte(tiles((0.5, 0.0, 0.4), (0.6, 0.3, 0.0)))), (FLOOR,)),
-    ZeroCase("texel_zero_in_all", lambda: floor(matte(tiles((0, 0, 0), (0.6, 0.3, 0.5)))), (FLOOR,)),
+    ZeroCase("texel_zero_in_one_channel", lambda: floor(matte(tiles((0.5, 0.0, 0.4), (0.6, 0.3, 0.0)))), (TEXELS,)),
+    ZeroCase("texel_zero_in_all", lambda: floor(matte(tiles((0, 0, 0), (0.6, 0.3, 0.5)))), (TEXELS,)),
     ZeroCase("everything_black", lambda: room(floor=matte(tiles((0, 0, 0), (0, 0, 0))), wall=matte(rgb(0, 0, 0)),
                                               side=matte(rgb(0.5, 0, 0.5))),
-             (FLOOR, "wall.brdf_0.reflectance.value", "side.brdf_0.reflectance.value"), max_depth=5),
+             (TEXELS, "wall.brdf_0.reflectance.value", "side.brdf_0.reflectance.value"), max_depth=5),
     ZeroCase("lamp_zero_in_one_channel", lambda: room(lamp=lamp(radiance=rgb(2, 0, 3))),
              ("lamp.emitter.radiance.value", "floor.brdf_0.reflectance.value")),
     ZeroCase("lamp_zero_in_all", lambda: room(lamp=lamp(radiance=rgb(0, 0, 0))), ("lamp.emitter.radiance.value",)),
     ZeroCase("lamp_and_texel_zero", lambda: floor(matte(tiles((0, 0.4, 0), (0.6, 0.3, 0.5))),
                                                   lamp=lamp(radiance=rgb(0, 2, 3))),
-             ("lamp.emitter.radiance.value", FLOOR)),
+             ("lamp.emitter.radiance.value", TEXELS)),
     ZeroCase("lamp_texture_zero_in_one_channel",
              lambda: room(lamp=lamp(radiance=tiles((4, 0, 3), (1, 2, 5)))), ("lamp.emitter.radiance.data",),
              fixed_paths=False),
@@ -254,16 +255,16 @@ ZERO_CASES = [
                                                            "intensity": rgb(0, 1, 0)}), ("light.intensity.value",)),
     ZeroCase("constant_zero", lambda: room(lamp=None, light={"type": "constant", "radiance": rgb(0, 1, 0)}),
              ("light.radiance.value",), spp=128),
-    ZeroCase("opacity_0", lambda: _mask(0.0), ("veil.bsdf.opacity.value",), fixed_paths=False, spp=256, lost=CLIPPED),
-    ZeroCase("opacity_1", lambda: _mask(1.0), ("veil.bsdf.opacity.value",), "down",
+    ZeroCase("opacity_0", lambda: veiled(0.0), ("veil.bsdf.opacity.value",), fixed_paths=False, spp=256, lost=CLIPPED),
+    ZeroCase("opacity_1", lambda: veiled(1.0), ("veil.bsdf.opacity.value",), "down",
              fixed_paths=False, spp=256, lost=NOT_SAMPLED),
-    ZeroCase("opacity_0_in_view", lambda: _mask(0.0, **_IN_VIEW), ("veil.bsdf.opacity.value",),
+    ZeroCase("opacity_0_in_view", lambda: veiled(0.0, _IN_VIEW), ("veil.bsdf.opacity.value",),
              fixed_paths=False, lost=CLIPPED),
-    ZeroCase("opacity_1_in_view", lambda: _mask(1.0, **_IN_VIEW), ("veil.bsdf.opacity.value",), "down",
+    ZeroCase("opacity_1_in_view", lambda: veiled(1.0, _IN_VIEW), ("veil.bsdf.opacity.value",), "down",
              fixed_paths=False, lost=NOT_SAMPLED),
-    ZeroCase("opacity_near_0", lambda: _mask(0.08), ("veil.bsdf.opacity.value",), "both", fixed_paths=False, step=0.08,
+    ZeroCase("opacity_near_0", lambda: veiled(0.08), ("veil.bsdf.opacity.value",), "both", fixed_paths=False, step=0.08,
              spp=512),
-    ZeroCase("opacity_near_1", lambda: _mask(0.92, **_IN_VIEW), ("veil.bsdf.opacity.value",), "both",
+    ZeroCase("opacity_near_1", lambda: veiled(0.92, _IN_VIEW), ("veil.bsdf.opacity.value",), "both",
              fixed_paths=False, step=0.08, spp=256),
     ZeroCase("blend_0", lambda: floor(blend(tiles((0,), (0.4,)))), ("floor.weight.data",),
              fixed_paths=False, lost=CLIPPED),
@@ -372,8 +373,8 @@ NAMES = ("texture", "roulette", "passes", "gaussian", "thin_lens", "plastic", "g
          "envmap", "visible_lamp")  # fmt: skip
 
 
-def options(case: GradientCase) -> dict:
-    return {**case.options, **case.both}
+def options(case: SceneCase) -> dict:
+    return case.own
 
 
 @taking_turns("name", NAMES, "adjoint", ("correlated", "independent"), FEW_TRAJECTORIES)
@@ -447,7 +448,7 @@ ADJOINTS = {
 @pytest.fixture(scope="module")
 def case_of_two() -> Case:
     bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(3, 4)}}
-    return Case(floor(bsdf), [FLOOR])
+    return Case(floor(bsdf), [TEXELS])
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.moving import mesh
 from conformance.scenes import (
     RED,
     SAME,
@@ -26,6 +25,8 @@ from conformance.scenes import (
     transform,
 )
 from turns import a_few
+
+from reslrb_cli.measure.scenes.moving import mesh
 
 pytestmark = pytest.mark.usefixtures("samples")
 
@@ -57,7 +58,7 @@ def facets(bsdf: dict[str, Any], smooth: bool = True, **things: Any) -> mi.Mesh:
     quads = [(i * m + j, i * m + (j + 1) % m, (i + 1) * m + j, (i + 1) * m + (j + 1) % m)
              for i in range(n) for j in range(m)]  # fmt: skip
     faces = [(a, b, c) for a, b, c, _ in quads[m:]] + [(b, d, c) for _, b, c, d in quads[:-m]]
-    return mesh(0.5 * normals + [0, 0.7, 0], np.array(faces), bsdf, "ball", normals if smooth else False, **things)
+    return mesh(0.5 * normals + [0, 0.7, 0], np.array(faces), bsdf, None, smooth and normals, "ball", **things)
 
 
 def shapes() -> dict[str, Any]:

@@ -73,7 +73,7 @@ def test_second_step_compiles_nothing(name: str, adjoint: str):
     """The steps' dL/dI changes with the image."""
     case = next(case for case in CASES if case.name == name)
     scene = Case(case.scene(), case.keys)
-    ours = integrator("reslrb", **case.both | case.options)
+    ours = integrator("reslrb", **case.own)
 
     def loss(image: Any) -> Any:
         return dr.sum(dr.square(image[:, :, :3] - scene.weights), axis=None)

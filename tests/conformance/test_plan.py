@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.gradient_cases import FLOOR
+from conformance.gradient_cases import TEXELS
 from conformance.operations import count, tracking, with_change
 from turns import a_few, taking_turns
 
@@ -103,23 +103,23 @@ def differs(a: np.ndarray, b: np.ndarray) -> float:
 #: Each row: the feature (a member of the plan or of its needs), a scene that does not need it, the parameters, and the
 #: estimators whose kernels shrink.
 OMISSIONS = [
-    ("has_visible_emitters", in_the_dark, (FLOOR,), STEADY),
-    ("has_shading_normals", plain, (FLOOR,), STEADY),
-    ("has_perturbed_normals", plain, (FLOOR,), STEADY),
-    ("has_null", plain, (FLOOR,), STEADY),
-    ("has_instances", plain, (FLOOR,), STEADY),
-    ("principal_point", plain, (FLOOR,), STEADY),
-    ("near_clip", plain, (FLOOR,), STEADY),
-    ("lens_clip", through_a_lens, (FLOOR,), STEADY),
+    ("has_visible_emitters", in_the_dark, (TEXELS,), STEADY),
+    ("has_shading_normals", plain, (TEXELS,), STEADY),
+    ("has_perturbed_normals", plain, (TEXELS,), STEADY),
+    ("has_null", plain, (TEXELS,), STEADY),
+    ("has_instances", plain, (TEXELS,), STEADY),
+    ("principal_point", plain, (TEXELS,), STEADY),
+    ("near_clip", plain, (TEXELS,), STEADY),
+    ("lens_clip", through_a_lens, (TEXELS,), STEADY),
     # The scene must not hold the lamp, whose surface is black: connections from there would be drawn, too.
-    ("track_zeros", in_the_dark, (FLOOR,), STEADY),
-    ("bsdfs_read_geometry", plain, (FLOOR,), ("stack",)),
-    ("differentiate_delta", with_glass, (FLOOR,), STEADY),
+    ("track_zeros", in_the_dark, (TEXELS,), STEADY),
+    ("bsdfs_read_geometry", plain, (TEXELS,), ("stack",)),
+    ("differentiate_delta", with_glass, (TEXELS,), STEADY),
     # With the feature, `gather` remembers the last vertex with a differentiated parameter, in as many operations.
-    ("differentiate_null", with_veil, (FLOOR,), ("reservoir", "stack")),
+    ("differentiate_null", with_veil, (TEXELS,), ("reservoir", "stack")),
     # Dr.Jit drops these features by itself, since nothing reads their results.
-    ("has_delta_lobes", plain, (FLOOR,), ()),
-    ("thin_lens", plain, (FLOOR,), ()),
+    ("has_delta_lobes", plain, (TEXELS,), ()),
+    ("thin_lens", plain, (TEXELS,), ()),
 ]
 
 #: The default suite runs one estimator per row: the next one of those whose kernels shrink.
@@ -152,10 +152,10 @@ def test_an_omission_changes_nothing_and_shrinks_the_kernel(feature, make, keys,
 
 #: The requested parameters, and the parameters that are added to them.
 ASKED = {
-    "emitters only": ((RADIANCE,), (FLOOR,)),
-    "BSDFs only": ((FLOOR,), (RADIANCE,)),
-    "textured BSDF only": ((FLOOR,), (WALL,)),
-    "plain BSDF only": ((WALL,), (FLOOR,)),
+    "emitters only": ((RADIANCE,), (TEXELS,)),
+    "BSDFs only": ((TEXELS,), (RADIANCE,)),
+    "textured BSDF only": ((TEXELS,), (WALL,)),
+    "plain BSDF only": ((WALL,), (TEXELS,)),
 }
 
 
@@ -193,7 +193,7 @@ def test_emitters_alone_need_no_replay(estimator: str):
 
 
 def test_rows_explain_needed_features() -> None:
-    case, ours = Case(through_a_lens(), (FLOOR,)), integrator("reslrb", 5, estimator="stack")
+    case, ours = Case(through_a_lens(), (TEXELS,)), integrator("reslrb", 5, estimator="stack")
     with tracking(case.params, case.keys):
         rows = plan_rows(ours.plan(case.scene, case.scene.sensors()[0], case.params), [])
     assert {row.feature for row in rows if row.needed} == {"visible emitters", "derivatives of BSDFs"}
@@ -201,7 +201,7 @@ def test_rows_explain_needed_features() -> None:
 
 
 def test_every_automatic_setting_has_a_row_with_the_reason_of_its_decision() -> None:
-    plan = integrator("reslrb", 5).plan(scene := Case(plain(), (FLOOR,)).scene, scene.sensors()[0])
+    plan = integrator("reslrb", 5).plan(scene := Case(plain(), (TEXELS,)).scene, scene.sensors()[0])
     decisions = [Decision(setting=setting, value="auto", why=f"reason {k}") for k, setting in enumerate(AUTO_VALUES)]
     texts = [row.reason for row in plan_rows(plan, decisions)]
     assert all(any(text.endswith(f"{each.setting}: auto, {each.why}") for text in texts) for each in decisions)
@@ -218,7 +218,7 @@ def test_a_step_makes_two_plans(monkeypatch: pytest.MonkeyPatch) -> None:
         return original(self, scene, sensor, params, spp, image, forward)
 
     monkeypatch.setattr(Preparation, "plan", noting)
-    case, ours = Case(plain(), (FLOOR,)), integrator("reslrb", 5, estimator="stack", guiding="on")
+    case, ours = Case(plain(), (TEXELS,)), integrator("reslrb", 5, estimator="stack", guiding="on")
     for seed in range(3):
         case.gradient(ours, seed, 16, adjoint="batched")
         assert asked == [False, True]

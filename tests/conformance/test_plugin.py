@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare, renders
-from conformance.gradient_cases import FLOOR, _mask, _textured
+from conformance.gradient_cases import TEXELS, _textured
 from conformance.scenes import plugin
 from turns import a_few
 
@@ -26,6 +26,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import Adjoint, gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
+from reslrb_cli.measure.scenes.catalogue import veiled
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -115,14 +116,14 @@ def _registered(llvm: str) -> None:
 @pytest.fixture(scope="module")
 def case(llvm: str) -> Case:
     """Case with the textured room."""
-    return Case(_textured(), (FLOOR,))
+    return Case(_textured(), (TEXELS,))
 
 
 @pytest.fixture(scope="module")
 def shown(llvm: str) -> Case:
     """Case with the textured room and an emitter in view."""
     sign = lamp(radiance=rgb(0.5, 0.6, 0.7)) | {"to_world": _facing()}
-    return Case(_textured(sign=sign), (FLOOR,))
+    return Case(_textured(sign=sign), (TEXELS,))
 
 
 def _facing() -> Any:
@@ -236,10 +237,10 @@ def test_sensors_beside_the_scene_have_facts_of_their_own(case: Case):
     for sensors in ([large], [small, large]):
         tracer = integrator("reslrb", estimator="stack", paths="camera", pixels="measured")
         for sensor in sensors:
-            dr.enable_grad(case.params[FLOOR])
+            dr.enable_grad(case.params[TEXELS])
             case.params.update()
             step(tracer, case.scene, sensor, lambda image: dr.sum(image, axis=None), seed=1, spp=16, params=case.params)
-            gradient = np.array(dr.grad(case.params[FLOOR]))
+            gradient = np.array(dr.grad(case.params[TEXELS]))
             case.set(case.initial)
         found.append(gradient)
     assert np.abs(found[0]).max() > 0
@@ -332,7 +333,7 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
     """The parameters are a function of a latent variable. Gradients reach this variable, and agree with the gradients
     of our own step.
     """
-    ours, key, steps = plugin("reslrb"), FLOOR, []
+    ours, key, steps = plugin("reslrb"), TEXELS, []
     for seed in seeds(12):
         latent = mi.Float(0.8)
         dr.enable_grad(latent)
@@ -351,11 +352,11 @@ def test_mi_render_backward_through_a_latent_variable(case: Case):
 
 
 def test_mi_render_adds_to_existing_gradients(case: Case):
-    ours, leaf = plugin("reslrb"), mi.TensorXf(case.params[FLOOR])
+    ours, leaf = plugin("reslrb"), mi.TensorXf(case.params[TEXELS])
     dr.enable_grad(leaf)
     sums = []
     for seed in (1, 2):
-        case.params[FLOOR] = mi.TensorXf(leaf)
+        case.params[TEXELS] = mi.TensorXf(leaf)
         case.params.update()
         dr.backward(case.objective(mi.render(case.scene, case.params, integrator=ours, seed=seed, spp=16)))
         sums.append(np.array(dr.grad(leaf)))
@@ -366,17 +367,17 @@ def test_mi_render_adds_to_existing_gradients(case: Case):
 @pytest.mark.long
 def test_one_latent_for_several_sensors(llvm: str):
     """Propagation for one view must not remove the edges above the parameters. The next view needs these edges."""
-    scene = Case(_textured(other=camera()), (FLOOR,))
+    scene = Case(_textured(other=camera()), (TEXELS,))
     for name in ("reslrb", "walk_ad", "ptracer", "prb"):
         tracer, sums = integrator(name), []
         latent = mi.Float(1)
         dr.enable_grad(latent)
-        scene.params[FLOOR] = mi.TensorXf(scene.initial[FLOOR].reshape(scene.params[FLOOR].shape)) * latent
+        scene.params[TEXELS] = mi.TensorXf(scene.initial[TEXELS].reshape(scene.params[TEXELS].shape)) * latent
         scene.params.update()
         for sensor in (0, 1):
             gradient_step(tracer, scene.scene, sensor, scene.objective, seed=5, spp=16, params=scene.params)
-            sums.append(np.array(dr.grad(scene.params[FLOOR])).sum())
-        dr.enqueue(dr.ADMode.Backward, scene.params[FLOOR])
+            sums.append(np.array(dr.grad(scene.params[TEXELS])).sum())
+        dr.enqueue(dr.ADMode.Backward, scene.params[TEXELS])
         dr.traverse(dr.ADMode.Backward)
         assert sums[1] == pytest.approx(2 * sums[0], rel=1e-4), name
         assert float(dr.grad(latent)[0]) > 0, name
@@ -388,7 +389,7 @@ def test_one_latent_for_several_sensors(llvm: str):
     [("floor_shape.to_world", "use auto"), ("lamp.to_world", "use auto"), ("camera.to_world", "not of the sensor")],
 )
 def test_naive_ad_refuses_moving_scenes_with_a_reason(key: str, reason: str):
-    case = Case(_textured(), (FLOOR,))  # its sensor has a box filter
+    case = Case(_textured(), (TEXELS,))  # its sensor has a box filter
     dr.enable_grad(case.params[key])
     case.params.update()
     with pytest.raises(UnsupportedScene, match=reason):
@@ -406,11 +407,11 @@ FOLLOWS = MOVES | {"edges": "on", "attached_sampling": "follow"}
 ORTHOGRAPHIC = {"type": "orthographic", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
 REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
     ({"fog": MEDIUM}, {}, "", "shape fog bounds a participating medium; no integrator here supports media"),
-    ({"fog": MEDIUM}, {}, FLOOR, "shape fog bounds a participating medium"),
+    ({"fog": MEDIUM}, {}, TEXELS, "shape fog bounds a participating medium"),
     (
         {"camera": ORTHOGRAPHIC | {"type": "perspective"} | FOGGED},
         {},
-        FLOOR,
+        TEXELS,
         "sensor camera is inside a participating medium; no integrator here",
     ),
     ({"bulb": {"type": "point"} | FOGGED}, {}, "", "emitter bulb is inside a participating medium; no integrator here"),
@@ -425,7 +426,7 @@ REFUSED: list[tuple[dict[str, Any], dict[str, Any], str, str]] = [
     ({"veil": VEIL}, MOVES, "floor_shape.to_world", "attached derivatives do not support masks and other surfaces"),
     ({}, FOLLOWS, "floor_shape.to_world", "attached_sampling: follow has no derivatives of edges between two surfaces"),
     ({"spot": CHECKERED}, {}, "", "Mitsuba cannot sample the rays of emitter spot: "),
-    ({"spot": CHECKERED}, {}, FLOOR, "Mitsuba cannot sample the rays of emitter spot: "),
+    ({"spot": CHECKERED}, {}, TEXELS, "Mitsuba cannot sample the rays of emitter spot: "),
     ({"ball": HAIR}, {}, "", "bsdf bsdf is `hair`, which changes if light and view are exchanged: light paths would"),
     (MIRRORS, {}, "", "sensor camera sees only smooth specular surfaces (glass, mirrors), to which light paths"),
 ]
@@ -538,7 +539,7 @@ def test_a_plan_is_not_reused_for_another_scene(llvm: str):
         assert not tracer.plan(scene.scene, scene.scene.sensors()[0]).needs.has_null
         del scene
         gc.collect()
-        masked = Case(_mask(0.5), ("wall.brdf_0.reflectance.value",))
+        masked = Case(veiled(0.5), ("wall.brdf_0.reflectance.value",))
         assert tracer.plan(masked.scene, masked.scene.sensors()[0]).needs.has_null
         del masked
         gc.collect()

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.gradient_cases import CASES, FLOOR, floor
+from conformance.gradient_cases import CASES, TEXELS, floor
 from turns import a_few
 
 from reslrb_cli.estimators.base import Pass
@@ -100,7 +100,7 @@ def test_a_replay_visits_the_same_vertices(name: str):
 
     case = BY_NAME[name]
     scene = Case(case.scene(), case.keys)
-    ours = integrator("reslrb", **case.both | case.options)
+    ours = integrator("reslrb", **case.own)
     with dr.suspend_grad():
         [samples] = ours.passes(Job(scene.scene, scene.scene.sensors()[0], mi.UInt32(5), 64))
         context = Pass(samples, None, None)
@@ -169,7 +169,7 @@ REFUSED = [
 @pytest.fixture(scope="module")
 def case() -> Case:
     bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture(3, 4)}}
-    return Case(floor(bsdf), [FLOOR])
+    return Case(floor(bsdf), [TEXELS])
 
 
 def spoilt(case: Case, bad: float) -> tuple:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import is_same
-from conformance.gradient_cases import _IN_VIEW, _mask, _pane, _textured
+from conformance.gradient_cases import _IN_VIEW, _pane, _textured
 from conformance.moving import camera as above
 from conformance.moving import enclosed, flat, sheet, under_glass
 from runs.going_on import one_thread
@@ -21,6 +21,7 @@ from turns import a_few
 
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
+from reslrb_cli.measure.scenes.catalogue import veiled
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, load, rgb, room
 from reslrb_cli.scene.rays import no_wavelengths
 from reslrb_cli.transport.film import AdjointImage, Film
@@ -57,7 +58,7 @@ SCENES: dict[str, tuple[Callable[[], dict[str, Any]], list[tuple[str, ...]]]] = 
     "moving": (lambda: small(enclosed), [(SLAB, LAMP), ("shell.bsdf.reflectance.value",), (LAMP,)]),
     "flat": (lambda: small(enclosed, slab=sheet("slab", diffuse(0.5, 0.4, 0.3), 0.1, 4, 0.0, 0.3)),
              [(SLAB,), ("shell.bsdf.reflectance.value",)]),
-    "mask": (lambda: _mask(0.4), [("veil.bsdf.opacity.value",), (WALL,)]),
+    "mask": (lambda: veiled(0.4), [("veil.bsdf.opacity.value",), (WALL,)]),
     "sky": (lambda: room(lamp=None, light={"type": "constant", "radiance": rgb(1, 0.5, 0.8)},
                          sheet=rippling(), camera=camera("gaussian")), [(SHEET,), ("light.radiance.value", WALL)]),
     "lamps": (lambda: room(other=lamp(radiance=rgb(3, 4, 5)) | {"to_world": mi.ScalarTransform4f().translate(

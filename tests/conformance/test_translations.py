@@ -15,11 +15,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conformance.edge_cases import ball, split_box
-from conformance.moving import Latents, Moving, mesh
+from conformance.moving import Moving
 from scipy import stats
 
 from reslrb_cli.measure.comparison import Deviation
 from reslrb_cli.measure.gradients import integrator, seeds, smooth_weights
+from reslrb_cli.measure.scenes.moving import Latents, mesh
 from reslrb_cli.measure.scenes.small import bitmap, diffuse, look_at, rgb, transform
 
 pytestmark = [pytest.mark.usefixtures("llvm"), pytest.mark.long]
@@ -89,7 +90,7 @@ def _square(to_world: Any, bsdf: dict[str, Any] = GREY, **things: Any) -> mi.Mes
     """Return a square of two triangles, of side 2 before `to_world`, with texture coordinates."""
     matrix, texcoords = np.array(to_world.matrix), np.array([0, 0, 1, 0, 1, 1, 0, 1])
     positions = SQUARE @ matrix[:3, :3].T + matrix[:3, 3]
-    return mesh(positions, np.array([[0, 1, 2], [0, 2, 3]]), bsdf, "square", texcoords=texcoords, **things)
+    return mesh(positions, np.array([[0, 1, 2], [0, 2, 3]]), bsdf, texcoords, name="square", **things)
 
 
 def _ball(x: float, y: float, z: float, radius: float, bsdf: dict[str, Any] = GREY, **things: Any) -> mi.Mesh:

@@ -12,7 +12,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conformance.moving import mesh
 from conformance.path_densities import CameraNotes, Densities, Emission, LightNotes, cosine, emitter_number, paths_of
 from measure.faults import Fault, plant, planted
 from turns import a_few
@@ -21,6 +20,7 @@ from reslrb_cli.integrators.plugin import make_integrator, make_reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.scenes import small
+from reslrb_cli.measure.scenes.moving import mesh
 from reslrb_cli.transport.camera import camera_walk
 from reslrb_cli.transport.emission import sample_emission
 from reslrb_cli.transport.walk import walk
@@ -90,7 +90,7 @@ def sheet(at: Any, bsdf: Any = WHITE, emitter: Any = None, leaning: float = 0, s
     normals = np.insert((corner - 0.5) * leaning, 1, -1, axis=1)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     things = {} if emitter is None else {"emitter": emitter}
-    return mesh(positions, faces, bsdf, "sheet", normals if leaning > 0 else False, corner, **things)
+    return mesh(positions, faces, bsdf, corner, leaning > 0 and normals, "sheet", **things)
 
 
 def room(lights: dict[str, Any], sensor: Any = None, film: Any = None, walls: Any = WHITE, **things: Any) -> Any:

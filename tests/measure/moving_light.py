@@ -65,7 +65,7 @@ def slab(bsdf: dict = GLASS, lamp: Any = None, **objects: Any) -> dict:
     positions, faces, uv = grid(64, lambda x, z: 1.8 + waves(x, z))
     return setting(
         lamp=spot() if lamp is None else lamp,
-        top=mesh(positions, faces, bsdf, uv),
+        top=mesh(positions, faces, bsdf, uv, True),
         bottom=rectangle(bsdf, translate=[0, 1.6, 0], rotate=([1, 0, 0], 90), scale=3),
         **objects,
     )
@@ -125,7 +125,7 @@ def ceiling(bsdf: dict = MIRROR) -> dict:
     """Return a scene with a mirror with waves that faces down and is lit from below."""
     positions, faces, uv = grid(64, lambda x, z: 1.9 + waves(x, z))
     return setting(lamp=spot(origin=(0.03, 0.6, -0.02), target=(0, 1.9, 0)),
-                   mirror=mesh(positions, faces[:, ::-1], bsdf, uv))  # fmt: skip
+                   mirror=mesh(positions, faces[:, ::-1], bsdf, uv, True))  # fmt: skip
 
 
 MIRRORS_SCENES = [
@@ -142,7 +142,7 @@ def point(position: tuple = (0.1, 1.5, 0.2)) -> dict:
 def hills() -> dict:
     """Return a scene with a slightly curved receiver under a point light."""
     positions, faces, uv = grid(128, lambda x, z: 0.05 * np.sin(2 * x + 1) * np.cos(3 * z), 4, 1.5)
-    return setting(floor=mesh(positions, faces, diffuse(0.8, 0.7, 0.6), uv), lamp=point())
+    return setting(floor=mesh(positions, faces, diffuse(0.8, 0.7, 0.6), uv, True), lamp=point())
 
 
 def rolling(scene: Any, name: str = "floor", y: float = 0) -> list[Move]:

@@ -47,6 +47,7 @@ from reslrb_cli.measure.references import (
     ptracer_image,
 )
 from reslrb_cli.measure.scenes import small
+from reslrb_cli.measure.scenes.case import Differences
 from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
 from reslrb_cli.measure.scenes.small import room as corner
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict, record_of
@@ -282,14 +283,14 @@ def test_references_match_the_conformance_tests(case):
     also `prb` except for keys of `floor.brdf`.
     """
     scene = Case(case.scene(), case.keys)
-    at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, case.both.get("max_depth", 4), False)
+    at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, case.options["max_depth"], False)
     reasons = {"ptracer": ptracer_gradient, "prb": prb_gradient}
     for key in case.keys:
-        if case.reference == "fd":
+        if isinstance(case.source, Differences):
             assert ptracer_gradient(at, key) is not None
             assert prb_gradient(at, key) is not None or key.startswith("floor.brdf")
         else:
-            assert reasons[case.reference](at, key) is None
+            assert reasons[case.source.name](at, key) is None
 
 
 def test_references_refuse_unsupported_parameters():

@@ -152,6 +152,11 @@ class SceneCase:
     not_spectral: str = ""
 
     @property
+    def own(self) -> dict[str, Any]:
+        """The options of `reslrb` and `walk_ad`."""
+        return {**self.options, **self.ours}
+
+    @property
     def way(self) -> dict[str, Any]:
         """The options that set the kinds of paths."""
         return {name: self.ours[name] for name in ("paths", "light_share") if name in self.ours}

@@ -543,7 +543,7 @@ def pool(
         "camera": seen | {"near_clip": 1e-2 * scale, "far_clip": 1e3 * scale},
         "floor": rectangle(diffuse(0.8, 0.7, 0.6), rotate=UP, scale=20 * scale),
         "lamp": light or beam((0.5, 3), (0.05, 1.8), 0.25, scale),
-        "top": mesh(scale * positions, faces, bsdf, uv),
+        "top": mesh(scale * positions, faces, bsdf, uv, True),
     }
     if thickness:
         below = [0, scale * (height - thickness), 0]

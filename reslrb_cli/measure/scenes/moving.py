@@ -17,8 +17,9 @@ from reslrb_cli.measure.scenes.small import load
 from reslrb_cli.scene.graph import SceneGraph
 
 Array = NDArray[np.float64]
-#: Sets parameters of a scene from numbers, by name.
-Place = Callable[[mi.SceneParameters, Mapping[str, Any]], None]
+#: Numbers, or arrays of numbers, by name, and a function that sets parameters of a scene from them.
+Latents = Mapping[str, Any]
+Place = Callable[[mi.SceneParameters, Latents], None]
 
 #: Waves of a surface: wave vectors, phases, and amplitudes with a mean slope of about 0.1.
 WAVES = (((5.1, 2.3), 0.4, 0.0135), ((-3.7, 5.9), 1.9, 0.012), ((7.9, -4.6), 4.1, 0.0062), ((2.2, -8.8), 2.7, 0.0055))
@@ -29,11 +30,11 @@ def waves(x: Array, z: Array) -> Array:
     return sum((a * np.sin(kx * x + kz * z + phase) for (kx, kz), phase, a in WAVES), np.zeros_like(x))
 
 
-def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = None, normals: np.ndarray | bool = True,
+def mesh(positions: Array, faces: Array, bsdf: dict, texcoords: Array | None = None, normals: np.ndarray | bool = False,
          name: str = "mesh", **things: Any) -> Any:  # fmt: skip
     """A mesh of vertices (V, 3) and triangles (F, 3), with texture coordinates (V, 2) if given.
 
-    `normals` are vertex normals (V, 3). If `normals` is true, Mitsuba interpolates them. If false, faces are flat.
+    Faces are flat unless vertex `normals` (V, 3) are given, or `normals` is true, and Mitsuba interpolates them.
     `things` are added to the mesh's dictionary, for example an emitter.
     """
     properties = mi.Properties()
@@ -168,7 +169,7 @@ Move = Displacement | Pose | Number
 
 
 @dataclass
-class Latents:
+class Placement:
     """Numbers that determine a scene. Replaces a `Selection` in a `Case`.
 
     `start` has a number or a row of numbers for each name, or None for a key of the scene, which is set directly.
@@ -218,7 +219,7 @@ def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Ca
     listed, params = moves(scene), mi.traverse(scene)
     initial = {move.key: _copy(params[move.key]) for move in listed}
 
-    def place(params: mi.SceneParameters, latents: Mapping[str, Any]) -> None:
+    def place(params: mi.SceneParameters, latents: Latents) -> None:
         at = 0
         for move in listed:
             own = [dr.gather(mi.Float, latents[AMPLITUDES], at + k) for k in range(move.size)]
@@ -226,7 +227,7 @@ def moving_case(description: dict, moves: Callable[[Any], Sequence[Move]]) -> Ca
             params[move.key] = move.value(initial[move.key], own)
 
     start = {AMPLITUDES: np.zeros(sum(move.size for move in listed))}
-    case = Case(scene, start, values=Latents(scene, start, place))
+    case = Case(scene, start, values=Placement(scene, start, place))
     case.weigh(smooth_weights(*case.weights.shape))
     return case
 
