@@ -222,9 +222,7 @@ class NonFiniteTally(_Tally):
             self.by_parameter[key] = self.by_parameter.get(key, 0) + count
 
     def __str__(self) -> str:
-        """Return the words for the last line of a run. The result is empty if all values were finite."""
-        if not self.iterations:
-            return ""
+        """Return the words for the last line of a run with values that were not finite."""
         parameters = ", ".join(f"{key} {count}" for key, count in self.by_parameter.items())
         where = f" ({parameters})" if parameters else ""
         return f"{self.values} values not finite{where} in {self.iterations} iterations"

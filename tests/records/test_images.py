@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import sys
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 
 from reslrb_cli.records.images import (
     FORMATS,
+    finite_range,
     load_image,
+    luminance,
     read_layers,
     write_file,
     write_image,
@@ -67,6 +70,32 @@ def test_a_heightmap_is_shown_from_lowest_to_highest(tmp_path):
     assert (seen.min(), seen.max()) == (0, 1)
     assert np.all(np.diff(seen.ravel()[: heights.size]) >= 0)
     assert imread(tmp_path / "wall.data.png").max() < 0.1
+
+
+@pytest.mark.usefixtures("llvm")
+def test_small_values_are_listed_and_large_ones_are_only_in_the_archive(tmp_path):
+    values = {"a.value": np.arange(64.0), "b.value": np.arange(65.0), "a.data": make_image(1)}
+    write_parameters(tmp_path, values)
+    listed = json.loads((tmp_path / "parameters.json").read_text())
+    assert listed == {"a.value": {"shape": [64], "value": list(range(64))}, "b.value": {"shape": [65]},
+                      "a.data": {"shape": [40, 30, 1], "file": "a.data.exr"}}  # fmt: skip
+    with np.load(tmp_path / "parameters.npz") as archive:
+        assert all(np.array_equal(archive[key], value) for key, value in values.items())
+
+
+@pytest.mark.usefixtures("llvm")
+def test_missing_and_damaged_images_are_none(tmp_path):
+    (tmp_path / "damaged.exr").write_bytes(b"\x76\x2f\x31\x01 and no more")
+    assert load_image(tmp_path / "damaged.exr") is load_image(tmp_path / "missing.exr") is None
+
+
+def test_ranges_and_luminances_of_images():
+    assert finite_range([np.array([np.nan, 3.0]), np.array([-1.0, np.inf])]) == (-1.0, 3.0)
+    assert finite_range([np.full(2, np.nan), np.zeros(0)]) == (0.0, 0.0)
+    image = make_image(4)
+    np.testing.assert_allclose(luminance(image), image[:, :, :3] @ np.float32([0.212671, 0.71516, 0.072169]), rtol=1e-6)
+    for channels in (1, 2):
+        assert np.array_equal(luminance(image[:, :, :channels]), image[:, :, 0])
 
 
 @pytest.mark.usefixtures("llvm")

@@ -129,6 +129,22 @@ def test_another_machine_may_hold_an_invisible_lock(tmp_path: Path, monkeypatch:
     assert not elsewhere.is_gone(tmp_path)
 
 
+def test_a_folder_that_cannot_be_opened_has_no_lock_to_test(tmp_path: Path) -> None:
+    """The number of the process decides, on this machine alone."""
+    here = Holder.here(locked=True)
+    assert not here.is_gone(tmp_path / "gone")
+    assert replace(here, pid=ended_pid()).is_gone(tmp_path / "gone")
+    assert not replace(here, host="elsewhere", pid=ended_pid()).is_gone(tmp_path / "gone")
+
+
+def test_a_process_of_another_user_is_alive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(process: int, number: int) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "kill", refuse)
+    assert not Holder.here(locked=False).is_gone(tmp_path)
+
+
 def test_dead_holders_without_locks(tmp_path: Path) -> None:
     here = Holder.here(locked=False)
     assert not here.is_gone(tmp_path)

@@ -16,7 +16,15 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines
-from reslrb_cli.records.metrics import MetricsWriter, NonFiniteTally, Record, Regularized, cut_back, finite
+from reslrb_cli.records.metrics import (
+    MetricsWriter,
+    NonFiniteTally,
+    Record,
+    Regularized,
+    RegularizedTally,
+    cut_back,
+    finite,
+)
 
 # metrics.jsonl: its keys, values without a number, and lines that a crash cut short.
 
@@ -165,6 +173,18 @@ def test_iterations_with_values_that_are_not_finite_are_counted():
         tally.add(make_record(nonfinite=count, nonfinite_by_parameter={"a": count} if count else {}))
     assert (tally.iterations, tally.values, tally.by_parameter) == (2, 4, {"a": 4})
     assert str(tally) == "4 values not finite (a 4) in 2 iterations"
+
+
+def test_costs_of_regularizers_are_the_last_ones_and_held_heights_are_counted():
+    tally = RegularizedTally()
+    assert str(tally) == ""
+    for held in ({"face": 3}, {"face": 0}, {"face": 2, "back": 1}):
+        tally.add(make_record(regularized=Regularized({"face": {"smooth": 0.125, "total": 0.0}}, held)))
+    tally.add(make_record())
+    assert (tally.iterations, tally.held_iterations) == (3, 2)
+    assert str(tally) == (
+        "beside the loss: smooth of face 0.125, heights held at the least thickness in 2 iterations (3 at last)"
+    )
 
 
 # The first line of a file of measurements.

@@ -108,6 +108,24 @@ def test_many_runs_at_once_leave_one_link(tmp_path):
     assert len(names(tmp_path)) == 9
 
 
+def test_a_name_that_another_run_takes_first_is_left_to_it(tmp_path, monkeypatch):
+    """Between the question whether the name is free and the renaming. Other errors end the run."""
+    rename, failing = os.rename, []
+
+    def taking(old, new):
+        if Path(new).name == "run":
+            failing or Path(new).mkdir()
+            raise OSError(errno.ENOTEMPTY, "Directory not empty", str(new))
+        rename(old, new)
+
+    monkeypatch.setattr(os, "rename", taking)
+    assert create(tmp_path).path.name == "run-2"
+    (tmp_path / "run").rmdir()
+    failing.append(True)
+    with pytest.raises(ConfigError, match="Directory not empty"):
+        create(tmp_path)
+
+
 def test_the_longest_name_leaves_room_for_a_number(tmp_path):
     name = check_name("ü" * (NAME_BYTES // 2))
     assert [create(tmp_path, name).path.name for _ in range(2)] == [name, f"{name}-2"]
