@@ -87,9 +87,6 @@ class Cluster:
             raise ConfigError("--cluster", "", "dask.distributed is not installed; run `pip install reslrb[cluster]`")
         return place
 
-    def __str__(self) -> str:
-        return self.address or f"local:{self.workers}"
-
     @property
     def threads(self) -> int | None:
         """The share of the cores of each worker of this machine. None for other workers."""

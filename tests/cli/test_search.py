@@ -438,6 +438,12 @@ def test_trials_at_work_are_avoided(folder):
     assert beside < 0.3
 
 
+def test_rounded_proposals_stay_in_their_range(folder):
+    space = [parse_vary(f"{RATE}={{low: 0.123449, high: 0.123451}}", search=True)]
+    plans = [SweepPlan("tiny.yaml", [], [], [seed]) for seed in range(4)]
+    assert all(0.123449 <= propose(space, plan, {})[RATE] <= 0.123451 for plan in plans)
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs affinities")
 def test_a_process_has_the_cores_of_its_place(monkeypatch):
     monkeypatch.setattr(jobs, "_PROGRAM", "import os; print(os.sched_getaffinity(0))")

@@ -4,6 +4,7 @@ distinguishes.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -127,6 +128,8 @@ def test_names_are_short_safe_and_different(folder):
     assert [in_words(each) for each in (0.1, 1e-05, True, None, "a, b", [1, 2.5], {"type": "sgd"})] == [
         "0.1", "1e-05", "true", "null", "'a, b'", "[1, 2.5]", "{type: sgd}",
     ]  # fmt: skip
+    nested = {"kind": [1, 2.5], "type": "b", "c": {"d": True}}
+    assert plans.named({"optimizer": nested}, []).name == "optimizer=b-kind=1-2.5-c=d=true"
     values = ["0.1, 0.2", "0.1-0.2", "../x", "A", "a", "x" * 500, "x" * 499 + "y", "ä\u202e"]
     text = json.dumps([{"a": value} for value in values], ensure_ascii=False).replace("\u202e", "\\u202e")
     scene = Path("scene.xml")
@@ -164,6 +167,7 @@ def test_names_are_short_safe_and_different(folder):
         (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
         (["-o", "tiny.yaml"], "Directory 'tiny.yaml' is a file"),
         (["-o", "."], ", but no sweep; give a new or empty folder"),
+        (["-o", "tiny.yaml/s"], "-o: cannot write to tiny.yaml/s (Not a directory); give another folder"),
     ],
 )  # fmt: skip
 def test_errors_are_reported_before_any_run(folder, arguments, line):
@@ -185,10 +189,59 @@ def test_a_folder_has_one_sweep(folder):
     more = tiny.done("sweep", "--resume", "s", "--seeds", 2)
     assert "2 of 2 runs done" in more.output
     assert "--seeds: is 1; the sweep has 2 seeds already" in reslrb("sweep", "--resume", "s", "--seeds", 1).output
+    assert "--trials: the sweep in the folder is not a search" in reslrb("sweep", "--resume", "s", "--trials", 3).output
+    assert (
+        "--seeds: 1 x 1001 seeds: a sweep has at most 1000 runs"
+        in reslrb("sweep", "--resume", "s", "--seeds", 1001).output
+    )
+    assert len(plans._grown(read_sweep(Path("s")), 1000, None).seeds) == 1000
     assert (
         "add only --seeds, --trials, --jobs or --allow-code"
         in reslrb("sweep", "--resume", "s", "--vary", "run.spp=[4]").output
     )
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "line"),
+    [
+        (errno.ENOSPC, 6, "s: No space left on device; the sweep has stopped"),
+        (errno.EACCES, 2, "-o: cannot write to s"),
+    ],
+)
+def test_an_unwritable_folder_is_named(folder, monkeypatch, number, code, line):
+    def fail(self, place):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(SweepPlan, "write", fail)
+    result = reslrb("sweep", "tiny.yaml", "--vary", "run.spp=[4]", "-o", "s")
+    assert (result.exit_code, line in result.output) == (code, True), result.output
+
+
+def test_the_last_seed_can_be_used(folder):
+    def sweep(first):
+        return make_plan(Path("tiny.yaml"), ["run.spp=[4]"], 2, [f"run.seed={first}"]).sweep
+
+    kept = sweep(2**32 - 3)
+    assert sweep(2**32 - 2).seeds == [2**32 - 2, 2**32 - 1]
+    assert plans._grown(kept, 3, None).seeds[-1] == 2**32 - 1
+    for make in (lambda: sweep(2**32 - 1), lambda: plans._grown(kept, 4, None)):
+        with pytest.raises(ConfigError, match="--seeds"):
+            make()
+
+
+def test_a_run_does_not_replace_other_files(folder):
+    """It replaces a run that was killed before its first checkpoint."""
+    plan = made("run.spp=[4]", seeds=1).sweep
+    name = run_name(*next(plan.runs))
+    run = Path("s", name)
+    run.mkdir(parents=True)
+    with pytest.raises(ConfigError, match=f"{name}: is no run's folder, and a run of the sweep needs the name"):
+        plans.command(Path("s"), plan, plan.combinations[0], 0)
+    (run / "manifest.json").write_text(json.dumps({"program": "reslrb", "status": "interrupted"}))
+    assert plans.command(Path("s"), plan, plan.combinations[0], 0)[:2] == [
+        "optimize", str(Path("s/configs/spp=4.yaml").absolute())
+    ]  # fmt: skip
+    assert not run.exists()
 
 
 def test_damage_is_located(folder):
@@ -206,6 +259,9 @@ def test_damage_is_located(folder):
         if name:
             with pytest.raises(ConfigError, match="no names of folders"):
                 read_sweep(Path("s"))
+    Path("s/sweep.json").write_text(json.dumps(content | {"version": 99}))
+    with pytest.raises(ConfigError, match=r"s/sweep\.json: version: was written by another version, 0"):
+        read_sweep(Path("s"))
 
 
 # --- runs, kills and what is left -------------------------------------------------------------------------------------

@@ -169,6 +169,12 @@ def test_on_a_full_disk_both_states_stay(tmp_path: Path, monkeypatch: pytest.Mon
     assert (iteration_of(tmp_path / "state.npz"), iteration_of(tmp_path / "previous.npz")) == (2, 1)
 
 
+def test_a_state_that_is_no_json_is_located(tmp_path: Path) -> None:
+    np.savez(tmp_path / "state.npz", state=np.frombuffer(b"{", np.uint8))
+    with pytest.raises(ConfigError, match=r"state\.npz: state: is no JSON, as a run writes it"):
+        read_state(tmp_path / "state.npz")
+
+
 def test_unopenable_files_are_located(tmp_path: Path) -> None:
     np.savez(tmp_path / "state.npz", a=np.ones(3))
     with pytest.raises(ConfigError, match="holds values alone, not the state of a run"):

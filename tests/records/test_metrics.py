@@ -14,6 +14,7 @@ from cli.tiny import read_metrics
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
+from reslrb_cli.records.clock import summarise
 from reslrb_cli.records.manifest import versions
 from reslrb_cli.records.measurement_files import Origin, read_lines
 from reslrb_cli.records.metrics import (
@@ -185,6 +186,11 @@ def test_costs_of_regularizers_are_the_last_ones_and_held_heights_are_counted():
     assert str(tally) == (
         "beside the loss: smooth of face 0.125, heights held at the least thickness in 2 iterations (3 at last)"
     )
+
+
+def test_compilation_counts_as_code_generation():
+    history = [{"execution_time": 1.0, "codegen_time": 2.0, "backend_time": 4.0}, {"execution_time": 8.0}, {}]
+    assert summarise(history) == (9.0, 6.0)
 
 
 # The first line of a file of measurements.

@@ -168,6 +168,8 @@ def test_without_locks_runs_still_work(tmp_path, monkeypatch):
     with RunFolder.create("c.yaml", tmp_path, "run", "", make_manifest()) as folder:
         content = read_manifest(folder.path)
         assert (content["status"], content["process"]["locked"]) == ("running", False)
+        with pytest.raises(ConfigError, match="is in use by a run"), opened(folder.path):
+            pass
 
 
 CONTEND = """

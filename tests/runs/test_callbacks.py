@@ -546,6 +546,41 @@ def test_a_logger_that_cannot_begin_ends_the_run(server: Any) -> None:
         calls.begin()
 
 
+def test_known_errors_and_held_out_losses_are_logged(server: Any) -> None:
+    """Values that a run does not have are left out."""
+    logger, found = server.make(), list[set[str]]()
+    calls = calls_of("a", 0, logger)
+    calls.begin()
+    logger._scalars = lambda values, iteration: found.append(set(values))
+    for known in ({}, {"held_out": 0.5}, {"parameter_rmse": 0.0, "parameter_errors": {"k": 0.0}}):
+        calls.iteration(replace(RECORD, **known))
+    plain, held_out, errors = found
+    assert held_out - plain == {"held_out"}
+    assert errors - plain == {"parameter_rmse", "error/k"}
+
+
+def test_images_of_several_views_are_named_by_their_sensors() -> None:
+    for sensors, names in (((3,), {"final"}), ((0, 3), {"final-0", "final-3"})):
+        listener = Listener()
+        calls_of("a", 0, listener).images("final", dict.fromkeys(sensors, np.zeros((2, 2, 1), np.float32)))
+        assert set(listener.images) == names
+
+
+def test_an_end_without_a_beginning_logs_nothing(server: Any) -> None:
+    for each in (server.make(), loggers.TensorBoard("here")):
+        calls_of("a", 0, each).end("failed")
+    assert server.entries == {}
+
+
+def test_tensorboard_needs_a_folder() -> None:
+    calls = calls_of("a", 0, loggers.TensorBoard())
+    calls._run = replace(calls._run, folder=None)
+    with pytest.raises(
+        rl.ConfigError, match=r"TensorBoard: needs a folder: give the run one, or TensorBoard\(FOLDER\)"
+    ):
+        calls.begin()
+
+
 def test_a_name_that_is_given_twice_counts_once(experiment: Path) -> None:
     names = ["tensorboard", "tensorboard"]
     assert len(loggers.callbacks_of(rl.load("tiny.yaml"), names, "--log")) == 1

@@ -29,7 +29,7 @@ from runs.hosts import hosts, make_certificates, missing
 from reslrb_cli.cluster import connection
 from reslrb_cli.cluster.connection import Cluster, connected
 from reslrb_cli.config.loader import load
-from reslrb_cli.errors import ConfigError, MachineError
+from reslrb_cli.errors import ConfigError, MachineError, ReslrbError
 from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.state import guiding_of
 from reslrb_cli.optimization.views import set_targets, target_arrays
@@ -234,6 +234,24 @@ def test_a_context_that_was_not_taken_is_taken_again(me: SimpleNamespace) -> Non
     for _ in range(2):
         with pytest.raises(ValueError, match="broken"):
             calls.perform(workload.key, pickle.dumps(_Broken()), str.upper, ())
+
+
+def test_an_error_of_the_user_reaches_the_run_as_text(me: SimpleNamespace) -> None:
+    """A ConfigError cannot be sent to another process."""
+
+    def fail(state: object) -> None:
+        raise ConfigError("a.yaml", "run.spp", "is wrong")
+
+    me.plugins["reslrb"] = workload = calls.Workload({"a": b"one"}, reads)
+    with pytest.raises(ReslrbError, match=r"a\.yaml: run\.spp: is wrong") as raised:
+        calls.perform(workload.key, b"", fail, ())
+    assert type(pickle.loads(pickle.dumps(raised.value))) is ReslrbError
+
+
+def test_a_worker_with_other_tables_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "restore_tables", lambda *given: "wall: 3 cells, not 4")
+    with pytest.raises(MachineError, match="a worker has other guiding tables than the run: wall: 3 cells, not 4"):
+        engine.Standing({}, {}, {}).take(SimpleNamespace())
 
 
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
@@ -545,6 +563,13 @@ def test_connections_are_encrypted(tmp_path: Path) -> None:
         security: Any = connection._certificates()
     assert security.require_encryption
     assert security.tls_client_key == files["key.pem"]
+    for wrong, why in (("", "is not set; give the file, for example by DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT=FILE"),
+                       ("gone.pem", "gone.pem cannot be read")):  # fmt: skip
+        with (
+            dask.config.set({**settings, f"{tls}.client.cert": wrong}),
+            pytest.raises(ConfigError, match=rf"--cluster: {tls}\.client\.cert: {why}"),
+        ):
+            connection._certificates()
 
 
 @pytest.mark.parametrize(("arguments", "message"), BAD)

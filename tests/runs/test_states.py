@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -26,6 +27,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.run_folder import read_config, read_value
+from reslrb_cli.runs import resume
 from reslrb_cli.runs.prepare import moves
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
@@ -228,6 +230,18 @@ def test_a_finished_run_is_reported(run: Path, capsys: pytest.CaptureFixture[str
     assert "is finished, after 6 of 6 iterations; --set run.iterations=NUMBER continues it" in capsys.readouterr().out
     assert (run / "manifest.json").read_bytes() == before
     assert "run.iterations: is 5; the run has done 6 already" in told(capsys, run, "--set", "run.iterations=5")
+
+
+def test_a_full_disk_leaves_the_run_as_it_was(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The state is not blamed, and stays."""
+
+    def fail(*given: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = (run / STATE).read_bytes()
+    monkeypatch.setattr(resume, "write_beginning", fail)
+    assert optimize("--resume", str(run), "--quiet") == 6
+    assert (run / STATE).read_bytes() == before
 
 
 def test_a_missing_run_is_reported(tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str]) -> None:

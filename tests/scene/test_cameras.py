@@ -162,7 +162,17 @@ BAD = [
     ({"fl_x": -3}, r"frames\[0\].fl_x: must be a positive number"),
     ({"frames": []}, "has no cameras"),
     ({"frames": 3}, "is not a transforms.json"),
-    ({"frames": [{"file_path": "a.exr", "transform_matrix": [1]}]}, r"transform_matrix: must be four rows"),
+    *(
+        ({"frames": [{"file_path": "a.exr", **matrix}]}, r"transform_matrix: must be four rows")
+        for matrix in (
+            {},
+            {"transform_matrix": [1]},
+            {"transform_matrix": [["x"] * 4] * 4},
+            {"transform_matrix": [[float("inf")] * 4] * 4},
+        )
+    ),
+    ({"frames": [{"file_path": ""}]}, r"frames\[0\].file_path: must name the camera's image"),
+    ({"frames": [{"transform_matrix": [1]}]}, r"frames\[0\].file_path: must name the camera's image"),
 ]
 
 
@@ -220,8 +230,31 @@ def test_errors_in_a_transforms_json(folder, changes, message):
         ("OPENCV_FISHEYE 40 24 50 50 20 12 0 0 0 0", r"cameras.txt:2: has model OPENCV_FISHEYE"),
         ("PINHOLE 40 24 50", "cameras.txt:2: is not a camera"),
         ("PINHOLE 40 24 50 51 20 12", "cameras.txt:2: has focal lengths 50 and 51"),
+        ("PINHOLE 40 24 0 0 20 12", "cameras.txt:2: must have a positive focal length and size"),
+        ("PINHOLE 0 24 50 50 20 12", "cameras.txt:2: must have a positive focal length and size"),
+        ("", "cameras.txt:2: has model none"),
     ],
 )
 def test_errors_in_a_cameras_txt(folder, model, message):
     with pytest.raises(ConfigError, match=message):
         read_cameras(write_colmap(folder, model))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (" 7 b.exr", " 8 b.exr", "images.txt:4: has camera 8, which cameras.txt lacks"),
+        (" 7 b.exr", " 7", "images.txt:4: has camera 7, which cameras.txt lacks, or no name"),
+        (" 7 b.exr", " b.exr", "images.txt:4: is not an image: IMAGE_ID, QW, QX"),
+        (" 7 a.exr\n0.5 0.5 -1\n", " 7 a.exr\n\n\n", None),  # an empty line between images
+    ],
+)
+def test_errors_in_an_images_txt(folder, old, new, message):
+    file = write_colmap(folder)
+    file.write_text(file.read_text().replace(old, new))
+    (folder / "cameras.txt").write_text("\n" + (folder / "cameras.txt").read_text())
+    if message is None:
+        assert [camera.name for camera in read_cameras(file)] == ["a", "b"]
+    else:
+        with pytest.raises(ConfigError, match=message):
+            read_cameras(file)
