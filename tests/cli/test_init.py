@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -12,10 +13,11 @@ from cli.tiny import reslrb, settings
 from click.testing import Result
 from kit import scene, sensor, shape
 
-from reslrb_cli.cli.init import PIXELS
+from reslrb_cli.cli.init import PIXELS, choose_size
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import TargetConfig
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
@@ -446,3 +448,25 @@ def test_the_reason_for_camera_paths_is_given(choices: Path) -> None:
     made = reslrb("init", "hall.xml", "--sensor", 1)
     assert "since" not in made.output
     assert "since" not in (choices / "hall.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("film", "photo", "fixed", "size"),
+    [
+        ((64, 32), None, False, (64, 32)),
+        ((1024, 256), None, False, (256, 64)),
+        ((1024, 256), None, True, (1024, 256)),
+        ((64, 32), (2048, 512), False, "such as 1024x512"),
+        ((64, 32), (512, 2048), False, "such as 512x256"),
+        ((1000, 1012), (100, 100), False, "such as 99x100"),  # as high as 100x101 would be too high
+        ((100, 100), (1000, 1009), False, (127, 129)),
+        ((100000, 1), None, False, (40477, 1)),
+    ],
+)
+def test_the_size_of_a_first_run(film, photo, fixed, size):
+    stored = photo and SimpleNamespace(size=photo, path="a.png")
+    if isinstance(size, str):
+        with pytest.raises(ConfigError, match=f"with another aspect ratio; crop it to .*{size}"):
+            choose_size(film, stored, fixed)
+    else:
+        assert choose_size(film, stored, fixed) == size

@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from cli.tiny import done, outcome
 
+from reslrb_cli.cli.inspect import _sized
+from reslrb_cli.scene.catalog import SensorSummary
+
 pytestmark = pytest.mark.usefixtures("llvm")
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
 TINY = ["--set", "scene.options={resx: 16, resy: 16}", "--set", "integrator.max_depth=4"]
@@ -208,3 +211,16 @@ def test_an_edited_decision_is_one_located_line(scene):
         assert (code, f"run/manifest.json: decisions: {said}" in err) == (2, True), err
     decide(value="camera", why="edited by hand")
     assert "paths: auto, edited by hand" in " ".join(lines_of("run"))
+
+
+@pytest.mark.parametrize(
+    ("crop", "text"),
+    [
+        (((0, 0), (8, 6)), "8x6"),
+        (((0, 0), (4, 6)), "8x6, crop 4x6 at (0, 0)"),
+        (((2, 1), (8, 6)), "8x6, crop 8x6 at (2, 1)"),
+    ],
+)
+def test_a_crop_is_shown(crop, text):
+    sensor = SensorSummary(0, "a", "perspective", "hdrfilm", (8, 6), crop, "box", 3, None, None, None)
+    assert _sized(sensor) == text

@@ -136,8 +136,10 @@ def test_images_of_the_cameras_are_not_rotated(folder):
 
 
 def test_a_missing_size_is_taken_from_the_images(folder):
-    path = write_nerf(folder, w=None, h=None, fl_x=None, fl_y=None, camera_angle_x=1.2)
     mi.Bitmap(np.zeros((HEIGHT // 2, WIDTH, 3), np.uint8)).write(str(folder / "b.png"))
+    [camera, other] = read_cameras(write_nerf(folder, cx=None, cy=None))
+    assert camera.center == other.center == (WIDTH / 2, HEIGHT / 2)
+    path = write_nerf(folder, w=None, h=None, fl_x=None, fl_y=None, camera_angle_x=1.2)
     path.write_text(path.read_text().replace("./b.exr", "./b"))  # Blender's files omit the suffix
     [camera, other] = read_cameras(path)
     assert camera.size == (WIDTH, HEIGHT)

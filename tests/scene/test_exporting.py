@@ -323,3 +323,18 @@ def test_values_that_mitsuba_reads_differently_are_refused_without_output(
     with pytest.raises(ConfigError, match="reads another value"):
         export(description, selection, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_values_agree_up_to_rounding_and_grey_agrees_with_colours():
+    colour = mi.Color3f(0.5)
+    same = [(mi.Float(0.5), colour), (colour, mi.Color3f(0.5, 0.5, 0.500001)), (mi.Float(0), mi.Float(0))]
+    other = [(colour, mi.Color3f(0.5, 0.5, 0.51)), (mi.Float(0.4), colour), ([1, 2], [1, 2, 3]), (mi.Float(0), "text")]
+    assert all(replacing.same_values(*pair) and replacing.same_values(*pair[::-1]) for pair in same)
+    assert not any(replacing.same_values(*pair) or replacing.same_values(*pair[::-1]) for pair in other)
+
+
+def test_copies_of_files_have_names_of_their_own():
+    home, taken = Path("/scene"), {"textures/a.png", "assets/a.png", "assets/a-2.png"}
+    assert replacing._free(Path("/scene/textures/b.png"), home, taken) == "textures/b.png"
+    assert replacing._free(Path("/scene/textures/A.png"), home, taken) == "textures/A-2.png"
+    assert replacing._free(Path("/other/a.png"), home, taken) == "assets/a-3.png"

@@ -584,3 +584,23 @@ def test_non_finite_pixels_stay_isolated(tmp_path: Path) -> None:
     pixels = np.array(mi.Bitmap(str(smaller(tmp_path, values, (3, 3)))))
     assert np.argwhere(~np.isfinite(pixels)).tolist() == [[0, 2, 2]]
     assert np.allclose(pixels[np.isfinite(pixels)], 1)
+
+
+@pytest.mark.parametrize(
+    ("data", "is_whole"),
+    [
+        (b"P5 2 1 0\n\0\0", False),
+        (b"P5 2 1 65536\n\0\0\0\0", False),
+        (b"P5 2 1 100\n\x65\0", False),
+        (b"P2 2 1 100\n101 0\n", False),
+        (b"P5 2 1 100\n\x64\0", True),
+        (b"P2 2 1 65535\n65535 0\n", True),
+    ],
+)
+def test_values_are_at_most_the_maximum(data, is_whole, tmp_path):
+    (tmp_path / "a.pgm").write_bytes(data)
+    if is_whole:
+        assert read_image(tmp_path / "a.pgm", "linear")[0, :, 0].tolist() == [1, 0]
+    else:
+        with pytest.raises(ConfigError, match=r"a\.pgm: is not a readable image"):
+            read_image(tmp_path / "a.pgm")

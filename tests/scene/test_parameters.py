@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -109,6 +111,18 @@ def test_environment_map_has_no_halo(make_scene):
     assert tensor.shape == (8, 18, 3)
     assert np.array_equal(tensor[:, 0], tensor[:, -2])
     assert np.array_equal(tensor[:, -1], tensor[:, 1])
+
+
+def test_the_smallest_textures_have_two_texels_on_each_side(make_scene):
+    """Those of an environment map have three rows."""
+    for key, least in ((TEXTURE, [2, 2]), ("sky.data", [2, 3])):
+        for resolution in (least, [least[0] - 1, least[1]], [least[0], least[1] - 1]):
+            spec = {"key": key, "resolution": resolution}
+            if resolution == least:
+                assert select(make_scene(sky=envmap()), spec).array(key).shape[:2] == tuple(least[::-1])
+            else:
+                with pytest.raises(ConfigError, match=re.escape(f"must be at least {least}")):
+                    select(make_scene(sky=envmap()), spec)
 
 
 def test_mesh_attributes(make_scene):
