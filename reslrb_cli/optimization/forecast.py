@@ -14,7 +14,7 @@ from reslrb_cli.backend.doctor import free_bytes, resident_bytes
 from reslrb_cli.config.files import duration, in_words
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.loop import LEAST_ITERATIONS, bends_large, candidates, optimize, payment
+from reslrb_cli.optimization.loop import LEAST_ITERATIONS, bends_large, candidates, joint_cost, optimize
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import with_short_target
@@ -60,7 +60,7 @@ class IterationTimes:
             return cls(step_s)
         warm = records[-1:] if len(records) == 1 else records[1:]
         gradient_s = min((record.step_ms - record.codegen_ms) / 1e3 for record in warm) if optimizer.has_large else 0.0
-        due = [record for record in warm if payment(record.iteration) is not None] if optimizer.block.at else []
+        due = [record for record in warm if joint_cost(record.iteration) is not None] if optimizer.block.at else []
         joint = [record.curvature_s - gradient_s * bends_large(optimizer, record.iteration) for record in due]
         # The run stops measuring once the curvature is known.
         joint_s = min(joint[-1], statistics.median(joint)) if joint else 0.0
@@ -70,7 +70,7 @@ class IterationTimes:
         """Return the time of the iterations from `first` to before `last`."""
         large = sum(first <= 2**power - 2 < last for power in range(1, last.bit_length() + 2))
         cost = self.joint_s / max(self.step_s, 1e-9)
-        joint = sum(iteration >= first and payment(iteration, cost) is not None
+        joint = sum(iteration >= first and joint_cost(iteration, cost) is not None
                     for iteration in takewhile(lambda iteration: iteration < last, candidates()))  # fmt: skip
         return (last - first) * self.step_s + large * self.gradient_s + joint * self.joint_s
 

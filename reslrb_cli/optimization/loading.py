@@ -111,21 +111,21 @@ def load_configured(
         if look is not None:
             look(description)
 
-    named = words(config.model_dump(exclude={"run"}))
+    named = strings_in(config.model_dump(exclude={"run"}))
     return load_scene(scene.file, scene.options, scene.size, scene.cameras, prepare, keys, named)
 
 
-def words(settings: Any) -> Iterator[str]:
-    """Yield the texts in settings, which may be keys, globs or ids of the scene."""
+def strings_in(settings: Any) -> Iterator[str]:
+    """Yield all strings in settings. They may be keys, globs or ids of the scene."""
     if isinstance(settings, str):
         yield settings
     elif isinstance(settings, Mapping):
         for name, value in settings.items():
             yield str(name)
-            yield from words(value)
+            yield from strings_in(value)
     elif isinstance(settings, (list, tuple)):
         for value in settings:
-            yield from words(value)
+            yield from strings_in(value)
 
 
 def _lent_scene(config: Config, keys: list[str], specs: Sequence[ParameterSpec]) -> mi.Scene:

@@ -142,10 +142,10 @@ def measure_curvature(problem: Problem, iteration: int) -> None:
     """Measure the curvature for `auto`, if it is due. The gradient of `iteration` must be accumulated.
 
     The curvature of large parameters is measured with the samples of the iteration (`bends_large`), and the joint
-    curvature of small parameters by images with their own samples (`payment`).
+    curvature of small parameters by images with their own samples (`joint_cost`).
     """
     optimizer = problem.optimizer
-    if optimizer.block.at and payment(iteration) is not None:
+    if optimizer.block.at and joint_cost(iteration) is not None:
         measure_block(problem, iteration)
     if bends_large(optimizer, iteration):
         random = np.random.default_rng(seed(problem.config.run.seed, iteration, 0, "displacement"))
@@ -174,7 +174,7 @@ def candidates() -> Iterator[int]:
         iteration += iteration // 2 + 1
 
 
-def payment(iteration: int, cost: float = 0.0, least: float = 0.0) -> float | None:
+def joint_cost(iteration: int, cost: float = 0.0, least: float = 0.0) -> float | None:
     """Return the cost of the joint measurement in `iteration`, in samples of a step, or None if there is none.
 
     A candidate is left out if measuring would take more than its share of the samples. The first `LEAST_ITERATIONS`
@@ -200,7 +200,7 @@ def measure_block(problem: Problem, iteration: int) -> None:
     part, unit = part_of_samples(problem), problem.samples_per_pass or 1
     images = 2 * (len(changes) + 1) * len(problem.trained) / len(problem.drawn(iteration))
     cost, least = (images * spp / problem.config.run.spp for spp in (part, unit))
-    paid = payment(iteration, cost, least)
+    paid = joint_cost(iteration, cost, least)
     if paid is None:
         return
     part = max(int(part * paid / cost) // unit, 1) * unit

@@ -116,7 +116,7 @@ def _cleaner_target(results: Mapping[str, Any]) -> Remedy | None:
     """Return the proposal for a run that did not improve and has few samples in its target."""
     samples = results.get("samples") or {}
     step, target = samples.get("step"), samples.get("target")
-    if not (step and target and target < FEW_STEPS * step and _setbacks(results)):
+    if not (step and target and target < FEW_STEPS * step and _no_progress(results)):
         return None
     return _samples(max(FEW_STEPS * step, 4 * target))
 
@@ -130,7 +130,7 @@ def _longer(results: Mapping[str, Any]) -> Remedy | None:
     for a run without verdicts whose loss was still falling.
     """
     done, late = results.get("iterations") or LEAST_JUDGED, (results.get("loss_trend") or {}).get("late")
-    if done < LEAST_JUDGED and _setbacks(results) and _cleaner_target(results) is None:
+    if done < LEAST_JUDGED and _no_progress(results) and _cleaner_target(results) is None:
         return _iterations(200)
     if late == "fell" and not verdicts_of(results) and _loss_fell(results):
         return _iterations(2 * done)
@@ -324,13 +324,13 @@ def worst(results: Mapping[str, Any]) -> str | None:
 
 def warnings(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
     """Return warnings about a run that did not fail: a loss that did not fall, errors that rose, unreliable values."""
-    lines = _setbacks(results, sign)
+    lines = _no_progress(results, sign)
     return [
         *lines, *(_reasons(results) if lines else ()), *certainty_lines(results), *(results.get("unmeasured") or ())
     ]  # fmt: skip
 
 
-def _setbacks(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
+def _no_progress(results: Mapping[str, Any], sign: str = "+-") -> list[str]:
     """Return lines about a loss that did not fall, images that became worse, and errors that rose."""
     lines = []
     trend, ratio = results.get("loss_trend") or {}, image_ratio(results)
@@ -516,24 +516,24 @@ def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: 
     if _loss_fell(results) is None:
         few = ", too few to judge its result" if done < LEAST_JUDGED else ""
         return Outcome("open", f"The run finished after {count(done, 'iteration')}{few}.")
-    better, course = _course(results)
+    better, sentence = _improvement(results)
     verdicts = verdicts_of(results)
     open_keys = [key for key, verdict in verdicts.items() if verdict != SETTLED]
     if better and verdicts and not open_keys and not results.get("worse"):
         all_of = "its parameter is" if len(verdicts) == 1 else f"all {len(verdicts)} parameters are"
         export = shlex.join(["reslrb", "export", folder, "-o", "recovered"])
-        return Outcome("good", f"{course}, and {all_of} settled.", "Write the recovered scene:", export)
+        return Outcome("good", f"{sentence}, and {all_of} settled.", "Write the recovered scene:", export)
     remedy = advice(results)
     rest = (f"Try {remedy.words}:", remedy.command(manifest, folder)) if remedy is not None else ("", "")
     if rest[1] and not rest[1].startswith("reslrb "):
         rest = (f"{rest[0][:-1]}, with this in the configuration:", rest[1])
     if better and results.get("is_design"):  # no true values, so no certainty is missing
         export = shlex.join(["reslrb", "export", folder, "-o", "solid"])
-        return Outcome("good", f"{course}.", *(rest if rest[1] else ("Write the solid:", export)))
-    course += _settled(verdicts, open_keys, better)
+        return Outcome("good", f"{sentence}.", *(rest if rest[1] else ("Write the solid:", export)))
+    sentence += _settled(verdicts, open_keys, better)
     if results.get("worse") and not open_keys:
-        course += f". {shorten(results['worse'][0], KEY_WIDTH)} is farther from its true value than at the start"
-    return Outcome("open", f"{course}.", *rest)
+        sentence += f". {shorten(results['worse'][0], KEY_WIDTH)} is farther from its true value than at the start"
+    return Outcome("open", f"{sentence}.", *rest)
 
 
 def _settled(verdicts: Mapping[str, str], open_keys: Sequence[str], better: bool) -> str:
@@ -551,7 +551,7 @@ def _settled(verdicts: Mapping[str, str], open_keys: Sequence[str], better: bool
     return words
 
 
-def _course(results: Mapping[str, Any]) -> tuple[bool, str]:
+def _improvement(results: Mapping[str, Any]) -> tuple[bool, str]:
     """Return whether the values are better than at the start, as far as loss and known errors show, and a sentence
     about it without its full stop.
     """

@@ -86,7 +86,7 @@ def simulated(kind: str, iterations: int) -> tuple[types.SimpleNamespace, list[R
     records, elapsed_s = [], 0.0
     for number in range(iterations):
         curvature_s = 3.0 * loop.bends_large(optimizer, number)
-        if has_small and number < known and loop.payment(number, 9 / 4) is not None:
+        if has_small and number < known and loop.joint_cost(number, 9 / 4) is not None:
             curvature_s += 9.0
         curvature_s, new_s = (curvature_s + 20, 20.0) if number == 0 else (curvature_s, 0.0)
         elapsed_s += 4 + curvature_s + new_s

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.optimization.loop import close_enough, payment
+from reslrb_cli.optimization.loop import close_enough, joint_cost
 from reslrb_cli.optimization.optimizers import SMALL, Optimizer
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.measuring import PROBES, brightness, gradient_count
@@ -150,7 +150,7 @@ def run_auto(case: Case, start: Array, gradient: Gradient, off: float) -> Course
         values.append(x := now())
         gradients.append(g := gradient(x))
         accumulate(g)
-        if is_small and payment(iteration) is not None:
+        if is_small and joint_cost(iteration) is not None:
             optimizer.block.bend(off * case.H)
         elif not is_small and (iteration + 2) & (iteration + 1) == 0:
             with optimizer.displaced(np.random.default_rng(iteration)):

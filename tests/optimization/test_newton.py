@@ -620,7 +620,7 @@ def test_measurements_by_differences_have_the_same_guided_samples(kind, adjoint,
 def test_measuring_takes_at_most_its_share_of_the_samples(cost, fewest):
     """If the first measurement is too expensive, it has fewer samples, or waits."""
     least = fewest * cost
-    found = {iteration: loop.payment(iteration, cost, least) for iteration in range(300)}
+    found = {iteration: loop.joint_cost(iteration, cost, least) for iteration in range(300)}
     measured = {iteration: paid for iteration, paid in found.items() if paid is not None}
     for iteration in measured:
         total = sum(paid for earlier, paid in measured.items() if earlier <= iteration)
