@@ -101,6 +101,17 @@ def test_examples_are_unchanged_copies(tmp_path: Path, monkeypatch: pytest.Monke
                 assert mine.resolve().is_relative_to(tmp_path.resolve())
 
 
+def test_an_example_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even a link that leads nowhere."""
+    monkeypatch.chdir(tmp_path)
+    name, path = next(iter(examples().items()))
+    Path("of").mkdir()
+    Path("of", path.name).symlink_to(tmp_path / "nowhere")
+    result = reslrb("example", name, "-o", "of")
+    assert (result.exit_code, list(Path("of").iterdir())) == (2, [Path("of", path.name)])
+    assert f"of/{path.name}: exists; give another folder with -o, or remove it" in result.output
+
+
 def paths(value: str | list[str]) -> list[Path]:
     """Return the paths in a setting that names one file or several files."""
     return [Path(each) for each in (value if isinstance(value, list) else [value])]

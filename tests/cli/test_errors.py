@@ -113,6 +113,8 @@ def test_an_internal_error_keeps_its_traceback() -> None:
         (["optimize", "a.yaml", "--resume", "r"], "reslrb optimize: --resume RUN uses the configuration of the run"),
         (["optimize", "--resume", "r", "--dry-run"], "reslrb optimize: --dry-run is for a new run, --resume continues"),
         (["optimize", "a.yaml", "--dry-run", "--cluster", "local:2"], "reslrb optimize: --dry-run measures only this"),
+        (["report", *["gone"] * 100], "gone: no such file or folder"),
+        (["report", *["gone"] * 101], "RUN: 101 are given; a page shows at most 100"),
         (["sweep"], "reslrb sweep: Missing argument 'CONFIG'"),
         (["sweep", "a.yaml", "--resume", "s"], "reslrb sweep: --resume continues a sweep with its own settings"),
         (["sweep", "--resume", "s"], "s: no such file or folder; start a sweep by `reslrb sweep CONFIG --vary"),

@@ -172,6 +172,7 @@ def test_another_result_may_bring_another_proposal(folder, monkeypatch):
     tiny.done(*WORDS, "--trials", 2)
     plan = read_sweep(Path("s"))
     remaining, found = Remaining(Path("s"), replace(plan, search=replace(plan.search, trials=4))), []
+    assert (plan.size, remaining.sweep.size) == (2, 4)  # also of trials that are still to be chosen
 
     def nothing_new(varied, sweep, values):
         found.append(len(sweep.combinations))
@@ -206,6 +207,7 @@ def test_the_loss_counts_if_true_values_are_unknown(folder, monkeypatch):
         (["@", f"{RATE}={{low: 0.1, hi: 1}}"], "or a range such as {low: 0.01, high: 0.3, log: true}"),
         (["@", f"{RATE}={{low: 0.1, high: x}}"], "or a range such as"),
         (["@", f"{RATE}={{low: 0.1, high: 1, log: 1}}"], "or a range such as"),
+        (["@", "optimizer.type=[adam, sdg, sgd]"], "--vary optimizer.type=sdg: optimizer.type: "),
         (["@", f"{RATE}=0.1"], f"must be a list of values, such as {RATE}=[16, 32], or a range such as {RATE}={{low"),
         (["@", f"{SPP}={{low: 0.5, high: 4}}"], f"--vary {SPP}=0.5: run.spp: must be an integer"),
         (["@", f"{SPP}={{low: -1, high: 4}}"], f"--vary {SPP}=-1: run.spp: must be"),

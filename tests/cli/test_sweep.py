@@ -86,7 +86,7 @@ def table(folder):
 def test_all_combinations_with_all_seeds(folder):
     plan = made("optimizer=[{type: adam, learning_rate: 0.1}, {type: sgd}]", "run.spp=[4, 8, 12]", seeds=4)
     names = [run_name(*run) for run in plan.sweep.runs]
-    assert len(names) == len(set(names)) == 2 * 3 * 4
+    assert len(names) == len(set(names)) == plan.sweep.size == 2 * 3 * 4
     assert names[0] == "optimizer=adam-learning_rate=0.1-spp=4-seed=0"
     assert names[6] == "optimizer=adam-learning_rate=0.1-spp=4-seed=1"  # all combinations of one seed come first
     assert make_plan(Path("tiny.yaml"), ["run.spp=[4, 8]"], 3, ["run.seed=5"]).sweep.seeds == [5, 6, 7]

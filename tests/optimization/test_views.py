@@ -18,6 +18,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.views import Exposure, View, make_loss
+from reslrb_cli.records import run_folder
 from reslrb_cli.report.perceptual import ciede2000
 
 CHART = "ColorChecker N Ohta"
@@ -190,6 +191,11 @@ def test_render_shows_a_view_with_its_lamps(lamps, monkeypatch):
     assert np.abs(images[0] - images[1]).max() > 0.1 * images[0].mean()
     code, _, shown = outcome("render", "tiny.yaml", *settings(ONE_BY_ONE), "--sensor", 3, "-o", "3.exr")
     assert (code, "--sensor: is 3, but the experiment has 3 views" in shown) == (2, True)
+    config = load("tiny.yaml", [ONE_BY_ONE])  # as if it were that of a run
+    monkeypatch.setattr(run_folder, "recovered", lambda run, overrides: config)
+    monkeypatch.setattr(run_folder, "exposures", lambda run: {0: np.float32(2), 1: np.float32(3)})
+    assert "times 3, the run's exposure" in done("render", ".", "--sensor", 1, "-o", "b.exr").stdout
+    np.testing.assert_allclose(np.array(mi.Bitmap("b.exr")), 3 * images[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize(("setting", "key", "words"), BAD)

@@ -188,6 +188,25 @@ def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
         calls.perform(workload.key, b"", fail, ())
     assert [text.partition(" failed: ")[0] for text in me.reasons] == ["worker 1 (here)"] * 2
     assert me.reasons[1].endswith("No space left on device; it is restarted")
+    with pytest.raises(SystemExit):
+        calls.perform(workload.key, b"", exhaust, ())
+    assert me.reasons[2].startswith("worker 1 (here) failed: out of memory (host)")
+
+
+def exhaust(state: object) -> None:
+    raise MemoryError
+
+
+def test_failures_of_workers_are_explained() -> None:
+    from distributed import KilledWorker
+
+    workers = calls.Workers.__new__(calls.Workers)
+    killed = KilledWorker("a", SimpleNamespace(address="tls://here:1"), 3)
+    for error, text in ((killed, "the same call ended 4 workers, the last one at tls://here:1; see their warnings"),
+                        (TimeoutError(), f"no worker within {calls.NOBODY_S} s"),
+                        (MachineError("worker 1 fails"), "worker 1 fails")):  # fmt: skip
+        with pytest.raises(MachineError, match=f"--cluster: {text}"), workers._explained():
+            raise error
 
 
 def test_calls_have_more_time_than_the_longest_one(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:

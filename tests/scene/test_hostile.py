@@ -173,6 +173,30 @@ def test_elements_nested_too_deeply_are_one_line(tmp_path, text):
         load_scene(file)
 
 
+WEIGHT = '<float name="weight" value="0.5"/>'
+
+
+@pytest.mark.parametrize("case", ["twosided", "blendbsdf", "mask"])
+def test_a_bsdf_with_too_many_parts_is_one_line(tmp_path, case):
+    """Mitsuba visits a part as often as it is used. A chain of a few parts is no problem."""
+
+    def text(number):
+        if case == "twosided":
+            nested = '<bsdf type="twosided">' * number + '<bsdf type="diffuse"/>' + "</bsdf>" * number
+            return f"<shape type='sphere'>{nested}</shape>"
+        parts = ['<bsdf type="diffuse" id="b0"/>']
+        for n in range(number):
+            use = f'<ref id="b{n}"/>' if case == "mask" else f'<ref id="b{n}"/><ref id="b{n}"/>{WEIGHT}'
+            parts.append(f'<bsdf type="{case}" id="b{n + 1}">{use}</bsdf>')
+        return "".join(parts) + f"<shape type='sphere'><ref id='b{number}'/></shape>"
+
+    file = write(tmp_path, f"{HEAD}{text(3)}</scene>")
+    load_scene(file)
+    write(tmp_path, f"{HEAD}{text(3000 if case == 'mask' else 90)}</scene>")
+    with pytest.raises(ConfigError, match=rf"{file}:\d+: .*has more than 1000 nested BSDFs and textures"):
+        load_scene(file)
+
+
 @pytest.mark.parametrize("depth", [90, 110, 300, 600, 850, 900, 950, 990])
 def test_every_depth_of_elements_loads_or_is_one_line(tmp_path, depth):
     """Every pass over the elements has its own limit of recursion."""

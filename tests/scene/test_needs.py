@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +14,7 @@ from scipy.ndimage import maximum_filter
 
 from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.scene.catalog import summarise
+from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
     CROSSINGS,
     check_paths,
@@ -501,3 +503,9 @@ def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
 def test_pixels_are_widened_as_by_a_maximum_filter(margin: int) -> None:
     pixels = np.random.default_rng(0).random((7, 13)) < 0.05
     np.testing.assert_array_equal(widened(pixels, margin), maximum_filter(pixels, 2 * margin + 1))
+
+
+def test_a_shape_in_a_group_is_shown_if_the_scene_has_it_too():
+    group, scene = (SimpleNamespace(class_name=lambda name=name: name) for name in ("ShapeGroupPlugin", "Scene"))
+    assert not SceneGraph(parents={"shape": [group]}).is_shown("shape")
+    assert SceneGraph(parents={"shape": [group, scene]}).is_shown("shape")

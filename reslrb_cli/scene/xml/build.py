@@ -113,6 +113,7 @@ def _check(description: Description) -> list[Note]:
     notes: list[Note] = []
     objects = {child: item.type for item in description.root.walk() if item.is_object for child in item.children}
     images = {child: item for item in description.root.walk() if item.type in _IMAGES for child in item.children}
+    _check_parts(description.root)
     for element in description.root.walk():
         if element.is_object:
             _check_plugin(element)
@@ -145,6 +146,32 @@ def _materials(obj: Path) -> list[str]:
     """Return the names of the materials that an OBJ file uses, in their order."""
     found = re.findall(rb"^usemtl[ \t]+(.*?)\s*$", obj.read_bytes(), re.MULTILINE)
     return [name.decode(errors="replace") for name in dict.fromkeys(found)]
+
+
+#: Maximum number of parts of a BSDF. A part that is used twice counts twice, because Mitsuba visits it twice.
+_MOST_PARTS = 1000
+
+
+def _check_parts(root: Element) -> None:
+    """Refuse a BSDF with too many parts: Mitsuba would never finish. 90 nested `twosided` BSDFs have 2**90 parts."""
+    by_id, parts = root.by_id(), dict[Element, int]()
+
+    def count(element: Element) -> int:
+        if element not in parts:
+            parts[element] = 1  # ends circles, which Mitsuba refuses
+            used = [by_id.get(child.id, child) if child.tag == "ref" else child for child in element.children]
+            number = sum(count(child) for child in used if child.tag in ("bsdf", "texture"))
+            parts[element] = 1 + number * (2 if element.type == "twosided" and len(used) == 1 else 1)
+        return parts[element]
+
+    for element in root.walk("bsdf"):
+        try:
+            number = count(element)
+        except RecursionError:
+            number = _MOST_PARTS + 1
+        if number > _MOST_PARTS:
+            what = f"has more than {_MOST_PARTS} nested BSDFs and textures, counting each use"
+            raise element.fail("", f"{what}; a `twosided` uses its BSDF twice, and needs no other `twosided`")
 
 
 def _check_plugin(element: Element) -> None:
