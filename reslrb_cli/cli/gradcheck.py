@@ -4,6 +4,7 @@ lack.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ from reslrb_cli.config.loader import check_code
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError, ExitCode, did_you_mean
 from reslrb_cli.measure.methods import PATHS_OPTIONS, parse_checked
-from reslrb_cli.records.measurements import GradcheckRecord, Verdict
+from reslrb_cli.records.measurements import GradcheckRecord, MissingRecord, Verdict
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.gradcheck import Gradcheck
@@ -81,15 +82,30 @@ def _given(options: dict[str, str]) -> str | None:
 
 
 def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
-    """Measure, print and write; return the exit code. `variant` must be set."""
-    from reslrb_cli.measure.missing import MissingCheck
+    """Measure, print and write; return the exit code. `variant` must be set. Each parameter gets an equal part of the
+    time that the earlier ones left.
+    """
+    from reslrb_cli.measure.missing import MOST_SEEDS, MissingCheck
 
-    check = MissingCheck(config, options.budget, options.seeds, options.spp)
+    begin, check, records = time.monotonic(), MissingCheck.of_config(config, options.spp), list[MissingRecord]()
     echo(check.conditions())
-    keeper = Keeper(options.json_file, origin_of(variant), check.known)
+    keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
-        for record in check.run(lambda: interrupts.requested, keeper.refresh):
+        for place, key in enumerate(check.keys):
+            now = time.monotonic()
+            end = math.inf if options.seeds else now + (options.budget - (now - begin)) / (len(check.keys) - place)
+
+            def affords(_: int, end: float = end) -> bool:
+                return not interrupts.requested and time.monotonic() < end
+
+            record = check.measured(key, affords, options.seeds or MOST_SEEDS, looks=False)
+            if not record.seeds and affords(0):
+                raise ConfigError(check.source, "loss", f"has no derivative beside the initial value of {key}")
+            if interrupts.requested and not record.seeds:
+                break
+            records.append(record)
             echo(record.line())
+            keeper.refresh()
         keeper.finish(interrupts.requested)
         return ExitCode.INTERRUPTED if interrupts.requested else ExitCode.DONE
 

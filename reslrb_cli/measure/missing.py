@@ -17,14 +17,13 @@ A significant share differs from 0 by Student's t (`MissingRecord.margin`). A ru
 times. The limit accounts for all looks and directions. A complete derivative of a parameter counts as incomplete with a
 probability of at most `ALARM`.
 
-`MissingCheck` implements `gradcheck --missing` for an experiment. `check_missing` measures the missing share before a
+The command `gradcheck --missing` and runs share `MissingCheck`. `check_missing` measures the missing share before a
 run's first iteration, and decides `edges: auto`.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -47,10 +46,11 @@ from reslrb_cli.measure.gradients import (
     smooth_rows,
 )
 from reslrb_cli.measure.methods import NEVER, parse_cases
-from reslrb_cli.measure.participants import MOVING_DIRECTIONS, PATHS
+from reslrb_cli.measure.participants import PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
+from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import AIM, take_gradient
@@ -251,81 +251,116 @@ def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return samples.mean(0), samples.std(0, ddof=1) / np.sqrt(len(samples))
 
 
-#: Light paths of the image at which dL/dI is taken.
+#: Maximum numbers of seeds and views.
+MOST_SEEDS, MOST_VIEWS = FEWEST * GROWTH ** (LOOKS - 1), 4
+
+#: Light paths of the image at which the command takes dL/dI.
 IMAGE_PATHS = 2**22
 
-#: Estimator of the checked gradient: exact, and attached if anything moves.
+#: Estimator that the command checks: exact, and attached if anything moves.
 ESTIMATOR = "reslrb:stack"
 
 
 class MissingCheck:
-    """The measurement of missing terms on a loaded experiment. A variant must be set.
+    """Measurement of the missing shares of the parameters `keys`, for the losses of the `views`.
 
-    dL/dI is that of the loss at displaced values (`LineSegment`), and stays fixed. `count` is the number of seeds.
-    Raises ConfigError and UnsupportedScene.
+    `images` and `gradients` are the integrators, and `spp` are their samples per pixel. dL/dI is that of images with
+    `image_spp` samples per pixel.
     """
 
-    def __init__(self, config: Config, budget_s: float, count: int | None, spp: int | None) -> None:
-        self._budget, self._count, self._start = budget_s, count, time.perf_counter()
-        depth = config.integrator.max_depth
-        own_paths = config.integrator.options().get("paths", "auto")
-        [listed] = parse_cases(ESTIMATOR + ("(paths=auto)" if own_paths == "auto" else ""))
-        self._problem = problem = assemble(listed.at(config, depth, known=True, auto=True).with_exposures_fixed())
-        self.source, sensor = str(config.source), problem.sensors[0]
-        self.case = Case(problem.scene, problem.selection.keys, sensor, problem.selection)
-        height, width, _ = self.case.weights.shape
-        self.spp = spp or max(PATHS // (height * width), 1)
-        self._image_spp = max(IMAGE_PATHS // (height * width), 1)
+    def __init__(
+        self, problem: Problem, keys: Sequence[str], views: Sequence[View], images: Any, gradients: Any, spp: int,
+        image_spp: int,
+    ) -> None:  # fmt: skip
+        cases = [Case(problem.scene, keys, view.sensor, problem.selection) for view in views]
+        self.tracing = Tracing(cases, images, gradients, spp, problem.stop_if_interrupted)
+        self.problem, self.keys, self.views, self.image_spp = problem, keys, views, image_spp
+        self.source = str(problem.config.source)
+        moving = where_moved(problem.selection.params, problem.selection.scene_keys)
+        sizes = [_size(item.node.bbox()) for item in moving if item.is_shape]
+        self._extent = min([size for size in sizes if size > 0], default=_size(problem.scene.bbox()))
+
+    @classmethod
+    def of_run(cls, problem: Problem, keys: Sequence[str]) -> MissingCheck:
+        """Return the check before a run. The run's own integrator takes the samples."""
+        run, integrator = problem.config.run, problem.integrator
+        if isinstance(integrator, LightTracer):
+            integrator = integrator.to_measure()
+        spp = min(max(run.spp // 16, 1), problem.samples_per_pass or run.spp)
+        return cls(problem, keys, problem.trained[:MOST_VIEWS], integrator, integrator, spp, max(run.spp // 4, 1))
+
+    @classmethod
+    def of_config(cls, config: Config, spp: int | None) -> MissingCheck:
+        """Return the check of the command `gradcheck --missing`. A variant must be set. Raises ConfigError and
+        UnsupportedScene.
+        """
+        depth, own = config.integrator.max_depth, config.integrator.options()
+        [listed] = parse_cases(ESTIMATOR + ("(paths=auto)" if own.get("paths", "auto") == "auto" else ""))
+        problem = assemble(listed.at(config, depth, known=True, auto=True).with_exposures_fixed())
         options = problem.config.integrator.options() | {"paths": problem.paths}
-        options["edges"] = "off" if config.integrator.options().get("edges") == "off" else "on"
+        options["edges"] = "off" if own.get("edges") == "off" else "on"
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")} | {"paths": problem.paths}
-        rr_depth = NEVER if ends(depth) else options["rr_depth"]
-        self._tracing = Tracing([self.case], make_integrator("walk_ad", **shared, rr_depth=rr_depth),
-                                make_integrator("reslrb", **options, freeze=True), self.spp)  # fmt: skip
-        self._directions = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, MOVING_DIRECTIONS)
-        #: By parameter, in the order of `case.keys`, as far as measured.
-        self._found: dict[str, Missing] = {}
+        images = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
+        gradients = make_integrator("reslrb", **options, freeze=True)
+        [pixels] = pixels_of(problem.scene, problem.sensors[:1])
+        spp, image_spp = spp or max(PATHS // pixels, 1), max(IMAGE_PATHS // pixels, 1)
+        return cls(problem, problem.selection.keys, problem.views[:1], images, gradients, spp, image_spp)
 
     def conditions(self) -> str:
         """Describe the measurement in one line."""
-        height, width, _ = self.case.weights.shape
-        return f"{self.source}, film {width}x{height}, {self.spp} spp, dL/dI of the loss beside the initial values"
+        height, width, _ = self.tracing.cases[0].weights.shape
+        film = f"film {width}x{height}, {self.tracing.spp} spp"
+        return f"{self.source}, {film}, dL/dI of the loss beside the initial values"
 
-    def run(self, stop: Callable[[], bool], between: Callable[[], None] = lambda: None) -> Iterator[MissingRecord]:
-        """Measure the parameters in turn until `stop()`. Each parameter gets a share of the budget. `between` is called
-        after each seed.
+    def directions(self, key: str) -> list[Direction]:
+        """Return the directions of a parameter. A small parameter that moves light has one direction for each entry. A
+        large one has two smooth directions, and any other parameter has two random directions.
         """
-        for place, key in enumerate(self.case.keys):
-            if stop():
-                return
-            now = time.perf_counter()
-            end = now + (self._budget - (now - self._start)) / (len(self.case.keys) - place)
-            self._measure(key, end, stop, between)
-            yield self._found[key].record(self.source, key)
+        case, selection = self.tracing.cases[0], self.problem.selection
+        size, value = case.initial[key].size, case.values.value(key)
+        if not moves_light(selection.params, key):
+            return all_directions(case, selection, 2, 2)[key]
+        if size > SMALL:
+            rows = smooth_rows(key, value, self._extent, 2)
+        else:
+            rows = list((UNITS.get(key.rpartition(".")[2]) or REACH * self._extent) * np.eye(size))
+        return [Direction(embed(case, key, row), "both") for row in rows]
 
-    def known(self) -> list[MissingRecord]:
-        """Return the results of all parameters with enough seeds, in the order of the parameters."""
-        least = min(FEWEST, self._count or FEWEST)
-        return [found.record(self.source, key) for key, found in self._found.items() if found.count >= least]
+    def measured(
+        self, key: str, affords: Callable[[int], bool], most: int = MOST_SEEDS, looks: bool = True
+    ) -> MissingRecord:
+        """Measure one parameter with at most `most` seeds. With `looks`, the measurement ends when its record is
+        decided.
 
-    def _measure(self, key: str, end: float, stop: Callable[[], bool], between: Callable[[], None]) -> None:
-        problem, segments = self._problem, [self._tracing.segment(each) for each in self._directions[key]]
-        segments = [self._tracing.weigh(each, problem, problem.views[:1], self._image_spp) for each in segments]
+        `affords` tells whether a number of further samples may be taken. The record has no share if they are too few,
+        or if dL/dI is zero.
+        """
+        tracing, directions, fewest = self.tracing, self.directions(key), min(FEWEST, most)
+        at_a_seed, trial = 3 * tracing.spp * len(directions), 2 * len(PILOTS) * tracing.spp * len(directions)
+        least, segments = 2 * self.image_spp * len(directions) + fewest * at_a_seed, list[LineSegment]()
+        trials = next((count for count in range(4, 0, -1) if affords(least + count * trial)), 0)
+        for direction in directions if trials else ():
+            segment = tracing.segment(direction, trials)
+            segments.append(tracing.weigh(segment, self.problem, self.views, self.image_spp))
         if not any(np.any(weights) for segment in segments for weights in segment.weights):
-            raise ConfigError(self.source, "loss", f"has no derivative beside the initial value of {key}")
-        found = self._found[key] = Missing(segments)
-        for seed in seeds(self._count or 10**6):
-            enough = found.count >= FEWEST and (stop() or (self._count is None and time.perf_counter() > end))
-            if enough:
+            return MissingRecord(self.source, key, None, None, len(directions), 0)
+        found, look = Missing(segments), fewest
+        while True:
+            found.take(tracing, seeds(most)[found.count : found.count + FEWEST])
+            if looks and found.count == look:
+                if found.record(self.source, key).is_decided:
+                    break
+                look *= GROWTH
+            if found.count == most or not affords(min(FEWEST, most - found.count) * at_a_seed):
                 break
-            found.take(self._tracing, [seed])
-            between()
+        return found.record(self.source, key)
+
+
+def _size(box: Any) -> float:
+    return float(np.linalg.norm(np.array(box.max - box.min)))
 
 
 # --- before a run's first iteration -----------------------------------------------------------------------------------
-
-#: Maximum numbers of seeds and views.
-MOST_SEEDS, MOST_VIEWS = FEWEST * GROWTH ** (LOOKS - 1), 4
 
 
 def check_missing(
@@ -408,76 +443,12 @@ def measure_missing(problem: Problem) -> list[MissingRecord]:
         return []
     problem.apply()
     try:
-        found = _Short(problem, moving).measure()
+        found, check, run = [], MissingCheck.of_run(problem, moving), problem.config.run
+        limit = run.measuring * run.iterations * run.spp * len(problem.drawn(0)) / len(check.views)
+        for place, key in enumerate(moving):  # each one gets an equal part of the samples that the earlier ones left
+            end = check.tracing.spent + (limit - check.tracing.spent) / (len(moving) - place)
+            found.append(check.measured(key, lambda more, end=end: check.tracing.spent + more <= end))  # type: ignore[misc]
     finally:
         take_gradient(problem)
         problem.apply()
     return [record for record in found if not (record.parameter.endswith(f".{HEIGHTMAP}") and record.is_unknown)]
-
-
-class _Short:
-    """Samples of the loss derivatives along each parameter in `keys`. The run's own integrator takes the samples."""
-
-    def __init__(self, problem: Problem, keys: Sequence[str]) -> None:
-        self.problem, self.keys, run = problem, keys, problem.config.run
-        integrator = problem.integrator
-        if isinstance(integrator, LightTracer):
-            integrator = integrator.to_measure()
-        self._views = problem.trained[:MOST_VIEWS]
-        cases = [Case(problem.scene, keys, view.sensor, problem.selection) for view in self._views]
-        spp = min(max(run.spp // 16, 1), problem.samples_per_pass or run.spp)
-        self.tracing = Tracing(cases, integrator, integrator, spp, problem.stop_if_interrupted)
-        self._limit = run.measuring * run.iterations * run.spp * len(problem.drawn(0)) / len(self._views)
-        sizes = [_size(item.node.bbox()) for item in where_moved(self._params, problem.selection.scene_keys)
-                 if item.is_shape]  # fmt: skip
-        self._extent = min([size for size in sizes if size > 0], default=_size(problem.scene.bbox()))
-
-    @property
-    def _params(self) -> Any:
-        return self.problem.selection.params
-
-    def directions(self, key: str) -> list[Direction]:
-        """Return the directions of a parameter. A small parameter has one direction for each entry. A large parameter
-        has two smooth directions.
-        """
-        case = self.tracing.cases[0]
-        size, value = case.initial[key].size, case.values.value(key)
-        if size > SMALL:
-            rows = smooth_rows(key, value, self._extent, 2)
-        else:
-            rows = list((UNITS.get(key.rpartition(".")[2]) or REACH * self._extent) * np.eye(size))
-        return [Direction(embed(case, key, row), "both") for row in rows]
-
-    def measure(self) -> list[MissingRecord]:
-        """Measure all parameters. Each one gets an equal part of the samples that the earlier ones left."""
-        found = []
-        for place, key in enumerate(self.keys):
-            left = self._limit - self.tracing.spent
-            found.append(self.measured(key, self.tracing.spent + left / (len(self.keys) - place)))
-        return found
-
-    def measured(self, key: str, end: float) -> MissingRecord:
-        """Measure one parameter, as long as `Tracing.spent` does not exceed `end`. If the samples are too few, or if
-        dL/dI is zero, the record has no share.
-        """
-        tracing, directions, problem = self.tracing, self.directions(key), self.problem
-        source, image_spp = str(problem.config.source), max(problem.config.run.spp // 4, 1)
-        at_a_seed, found = 3 * tracing.spp * len(directions), Missing([])
-        trial = 2 * len(PILOTS) * tracing.spp * len(directions)
-        left = end - tracing.spent - 2 * image_spp * len(directions) - FEWEST * at_a_seed
-        if left >= trial:
-            segments = [tracing.segment(direction, min(int(left // trial), 4)) for direction in directions]
-            found = Missing([tracing.weigh(each, problem, self._views, image_spp) for each in segments])
-        if not any(np.any(weights) for segment in found.segments for weights in segment.weights):
-            return MissingRecord(source, key, None, None, len(directions), 0)
-        most, record = min(MOST_SEEDS, int((end - tracing.spent) // at_a_seed)), None
-        while found.count < most and (record is None or not record.is_decided):
-            look = min(max(FEWEST, GROWTH * found.count), most)
-            found.take(tracing, seeds(most)[found.count : look])
-            record = found.record(source, key)
-        assert record is not None
-        return record
-
-
-def _size(box: Any) -> float:
-    return float(np.linalg.norm(np.array(box.max - box.min)))

@@ -21,7 +21,7 @@ import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure import missing
 from reslrb_cli.measure.gradients import Case, Direction
-from reslrb_cli.measure.missing import LineSegment, Missing, Tracing, _Short, measure_missing, share_of
+from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing, measure_missing, share_of
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.manifest import read_manifest
@@ -176,10 +176,10 @@ def test_the_measurement_stays_within_its_samples(experiment: Path, monkeypatch:
 def test_the_scene_moves_once_for_each_place(experiment: Path, monkeypatch: pytest.MonkeyPatch):
     """A move of a large mesh takes longer than an image. Gradients of several views need only one move."""
     problem = assemble(load(experiment, ["parameters=[{motion: {of: box, free: [x, z]}}]"]))
-    short, moves = _Short(problem, ["box.x", "box.z"]), list[Any]()
-    [case] = short.tracing.cases
-    expected = case.gradient(short.tracing.gradients, 3, 4, step=case.known_step)
-    short.tracing.cases = [case, Case(problem.scene, short.keys, 0, problem.selection)]
+    check, moves = MissingCheck.of_run(problem, ["box.x", "box.z"]), list[Any]()
+    [case] = check.tracing.cases
+    expected = case.gradient(check.tracing.gradients, 3, 4, step=case.known_step)
+    check.tracing.cases = [case, Case(problem.scene, check.keys, 0, problem.selection)]
     hand_over = Selection.hand_over
 
     def counted(selection: Selection, values: Any) -> None:
@@ -189,11 +189,11 @@ def test_the_scene_moves_once_for_each_place(experiment: Path, monkeypatch: pyte
     monkeypatch.setattr(Selection, "hand_over", counted)
     leaves = case.leaves(case.initial)
     for _ in range(2):
-        found = case.gradient_of(leaves, short.tracing.gradients, 3, 4, step=case.known_step)
+        found = case.gradient_of(leaves, check.tracing.gradients, 3, 4, step=case.known_step)
         np.testing.assert_allclose(found, expected, rtol=1e-4)
     assert len(moves) == 1
     segments = [LineSegment(np.eye(2)[k], -0.1, 0.1, [np.array(case.weights)] * 2) for k in (0, 1)]
-    Missing(segments).take(short.tracing, range(3))
+    Missing(segments).take(check.tracing, range(3))
     assert len(moves) == 1 + 2 * (2 + 3)
 
 
@@ -287,14 +287,13 @@ def simulated(directions: int, share: float, whole: float, noise: float, count: 
             differences = whole + 1.7 * noise * a + noise * b
             return np.transpose([differences, differences - share * whole - noise * b])
 
-    short: Any = object.__new__(_Short)
-    short.problem = SimpleNamespace(config=SimpleNamespace(source="a.yaml", run=SimpleNamespace(spp=16)))
-    short._views = []
-    short.directions = lambda key: [Direction(np.ones(1), "both")] * directions
+    check: Any = object.__new__(MissingCheck)
+    check.problem, check.views, check.source, check.image_spp = None, [], "a.yaml", 4
+    check.directions = lambda key: [Direction(np.ones(1), "both")] * directions
     found = []
     for _ in range(count):
-        short.tracing = Simulated([], None, None, 1)
-        found.append(short.measured("x", 400.0 * directions))
+        check.tracing = tracing = Simulated([], None, None, 1)
+        found.append(check.measured("x", lambda more, own=tracing: own.spent + more <= 480 * directions))
     return found
 
 

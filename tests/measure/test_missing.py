@@ -22,7 +22,6 @@ from measure.moving_light import ROOMS_SCENES as ROOMS
 from measure.moving_light import SCENES, setting
 
 from reslrb_cli.config.loader import load
-from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import missing as missing_check
 from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing, _ratio, _sums
@@ -105,8 +104,8 @@ def slab_share() -> float:
 def test_a_texture_has_a_complete_derivative():
     """Colours are complete, because nothing moves."""
     config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
-    check = MissingCheck(config, 0, 6, 16)
-    [record] = check.run(lambda: False)
+    check = MissingCheck.of_config(config, 16)
+    record = check.measured(check.keys[0], lambda samples: True, 6)
     print(record)
     assert record.share is not None
     assert record.standard_error is not None
@@ -200,15 +199,17 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     assert "dL/dI of the loss beside the initial values" in shown[-2]
 
 
-def test_a_loss_without_a_derivative(monkeypatch: pytest.MonkeyPatch):
+def test_a_loss_without_a_derivative(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     """Without a segment to the floor, all images are black, including the target. The earlier check for black targets
     is disabled here.
     """
     monkeypatch.setattr(targets, "_check_light", lambda problem, say: None)
-    config = room("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
-    config = config.model_copy(update={"integrator": config.integrator.model_copy(update={"max_depth": 1})})
-    with pytest.raises(ConfigError, match="no derivative"):
-        list(MissingCheck(config, 0, 2, 16).run(lambda: False))
+    config = tmp_path / "lamp.yaml"
+    config.write_text(LAMP.format(folder=Path(__file__).parent))
+    assert call(str(config), "--missing", "--spp", "4", "--seeds", "3", "--set", "integrator.max_depth=1") == 2
+    assert "has no derivative beside the initial value of lamp.position" in capsys.readouterr().err
 
 
 # Derivatives of parameters that move light, compared with finite differences. A few scenes run by default, and all with
