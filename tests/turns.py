@@ -77,7 +77,7 @@ def real_room() -> Path:
     return folder / "scene.xml"
 
 
-# Parts of the long tests, of which each fits into 25 minutes (`--part K/N`).
+# Parts of the long tests, with equal numbers of tests of each file (`--part K/N`).
 
 
 def read_part(text: str) -> tuple[int, int]:

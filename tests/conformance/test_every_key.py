@@ -187,11 +187,16 @@ def in_red(bsdf: mi.BSDF, name: str, value: float, si: mi.SurfaceInteraction3f, 
     return np.array(dr.detach(f), np.float64)
 
 
-@pytest.mark.parametrize(("gloss", "rounding"), [(0.3, 1e-3), (0.9, 5e-3), (0.97, 0.03)])
+@pytest.mark.parametrize(("gloss", "rounding"), [(0.3, 1e-3), (0.9, 5e-3), (0.97, 0.03), (0.99, 0.05), (0.999, 0.15)])
 def test_a_narrow_clearcoat_in_closed_form(gloss: float, rounding: float) -> None:
-    """The clearcoat is K D(a) with D = (a^2 - 1) / (pi log(a^2) (1 + (a^2 - 1) cos^2)) and a = 0.1 - 0.099 gloss."""
+    """The clearcoat is K D(a) with D = (a^2 - 1) / (pi log(a^2) (1 + (a^2 - 1) cos^2)) and a = 0.1 - 0.099 gloss.
+
+    docs/limits.md has the errors. They are rounding of single precision, and nearly cancel.
+    """
     name, wi, count = "clearcoat_gloss.value", np.array([0.3, 0.2, 0.8]) / np.sqrt(0.77), 2000
-    m = np.random.default_rng(0).normal([0, 0, 1], [0.03, 0.03, 0], (count, 3))
+    a = 0.1 - 0.099 * gloss
+    width = min(2 * a, 0.03)
+    m = np.random.default_rng(0).normal([0, 0, 1], [width, width, 0], (count, 3))
     m /= np.linalg.norm(m, axis=1, keepdims=True)
     si, wo = dr.zeros(mi.SurfaceInteraction3f, count), vector(*(2 * (m @ wi)[:, None] * m - wi).T)
     si.wi = vector(*wi)
@@ -203,10 +208,10 @@ def test_a_narrow_clearcoat_in_closed_form(gloss: float, rounding: float) -> Non
         return (a**2 - 1) / (np.pi * np.log(a**2) * (1 + (a**2 - 1) * cos2))
 
     K = (in_red(coated, name, 0.0, si, wo) - in_red(plain, name, 0.0, si, wo)) / D(0.1)
-    a = 0.1 - 0.099 * gloss
     expected = K * (D(a * 1.00001) - D(a * 0.99999)) / (2e-5 * a) * -0.099
     found = in_red(coated, name, gloss, si, wo, tracked=True)
     assert np.linalg.norm(found - expected) < rounding * np.linalg.norm(expected)
+    assert found.sum() == pytest.approx(expected.sum(), rel=min(rounding, 0.03))
 
 
 @pytest.mark.parametrize(("distribution", "is_right"), [("beckmann", True), ("ggx", False)])

@@ -6,9 +6,11 @@ import errno
 import json
 import math
 import sys
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from cli.tiny import read_metrics
 
@@ -16,7 +18,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.clock import summarise
 from reslrb_cli.records.manifest import versions
-from reslrb_cli.records.measurement_files import Origin, read_lines
+from reslrb_cli.records.measurement_files import LivePage, Origin, read_lines
 from reslrb_cli.records.metrics import (
     MetricsWriter,
     NonFiniteTally,
@@ -191,6 +193,22 @@ def test_costs_of_regularizers_are_the_last_ones_and_held_heights_are_counted():
 def test_compilation_counts_as_code_generation():
     history = [{"execution_time": 1.0, "codegen_time": 2.0, "backend_time": 4.0}, {"execution_time": 8.0}, {}]
     assert summarise(history) == (9.0, 6.0)
+
+
+def test_a_page_takes_a_small_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is written at most every 5 seconds, and takes at most a twentieth of the time. A failure is its last one."""
+    now, written, takes = [100.0], list[float](), [0.1, 2.0, 0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    def write() -> None:
+        written.append(now[0])
+        now[0] += takes.pop(0)  # the fourth time fails
+
+    page = LivePage(write)
+    for tenth in range(1000, 2000):
+        now[0] = max(now[0], tenth / 10)
+        page.refresh()
+    np.testing.assert_allclose(written, [100, 105.1, 147.1, 152.1])
 
 
 # The first line of a file of measurements.

@@ -511,6 +511,15 @@ def test_each_run_has_its_entry(server: Any) -> None:
     assert len(server.entries) == 3
 
 
+def test_each_end_has_its_status(server: Any) -> None:
+    for status in ("finished", "interrupted", "failed"):
+        calls = calls_of(status, 0, server.make())
+        calls.begin()
+        calls.end(status)
+    ended = "KILLED" if isinstance(server, FakeMLflow) else "FAILED"  # W&B knows no interruption
+    assert [entry.status for entry in server.entries.values()] == ["FINISHED", ended, "FAILED"]
+
+
 def test_an_active_run_of_the_script_is_used(server: Any) -> None:
     own = Entry("own")
     server.entries[own.id] = server.active = server.run = own

@@ -343,7 +343,7 @@ def test_values_outlive_the_checkpoints(run: Path, tmp_path: Path, capsys: pytes
     with pytest.raises(SystemExit) as end:
         main.main(["export", str(run), "-o", str(tmp_path / "out")])
     assert not end.value.code, capsys.readouterr().err
-    with pytest.raises(ConfigError, match=f"did not recover `other`; it has `{tiny.KEY}`"):
+    with pytest.raises(ConfigError, match=f"did not recover `other`; it has `{tiny.KEY}`$"):
         read_value(run, "other")
     (run / "parameters/parameters.npz").unlink()
     with pytest.raises(ConfigError, match=r"has no checkpoint/state\.npz"):
