@@ -186,8 +186,8 @@ def command(**given: Any) -> None:
 
     from reslrb_cli.backend.variant import set_variant
     from reslrb_cli.lens import experiment
-    from reslrb_cli.lens.surface import Setting, is_even, shape_surface, similarity
-    from reslrb_cli.lens.transport import resized
+    from reslrb_cli.lens.surface import Setting, contrast_line, is_even, shape_surface, similarity
+    from reslrb_cli.lens.transport import lifted, resized
 
     options = LensOptions(**given)
     options.check()
@@ -235,6 +235,8 @@ def command(**given: Any) -> None:
         source = picture if key == "picture" else _OPTIONS.get(key, f"--{key}")
         raise ConfigError(source, "", error.message) from None
     echo(surface.summary())
+    if line := contrast_line(image, surface.floor):
+        echo(line)
     target, power = experiment.target_image(image, surface)
     film = target.shape[1], target.shape[0]
     preview, original = surface.forecast, resized(image, surface.forecast.shape)
@@ -255,8 +257,8 @@ def command(**given: Any) -> None:
             write_atomically(output / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
     for line in solid:
         echo(line)
-    # SSIM has a window of 7 x 7 pixels.
-    alike = f"; SSIM with the picture {similarity(preview, original):.2f}" if min(original.shape) >= 7 else ""
+    wanted = resized(lifted(image, surface.floor), preview.shape)
+    alike = f"; SSIM with the target {similarity(preview, wanted):.2f}" if min(preview.shape) >= 7 else ""
     echo(f"{output / 'preview.png'}: the caustic at the start{alike}")
     echo(f"{output / 'lens.yaml'}: {nx}x{ny} heights, a picture of {columns}x{rows} pixels")
     echo(f"next: `reslrb optimize {output / 'lens.yaml'}`")

@@ -270,6 +270,20 @@ def is_even(picture: Array) -> bool:
     return bool(picture.max() - picture.min() <= 0.02 * picture.max())
 
 
+def contrast_line(picture: Array, floor: float) -> str:
+    """Describe in one line how a floor changes a picture (H, W). The result is empty if the floor raises nothing."""
+    target = transport.lifted(picture, floor)
+    share = float(np.mean(picture < target))
+    if not floor or not share:
+        return ""
+    # SSIM has a window of 7 x 7 pixels.
+    alike = f"; the target has an SSIM of {similarity(target, picture):.2f} with the picture" if min(
+        picture.shape) >= 7 else ""  # fmt: skip
+    advice = "; a dark picture on a white ground keeps more contrast" if share > 0.5 else ""
+    return (f"contrast of at most {1 / floor:.3g} to 1: {100 * share:.2g} % of the picture is darker, and becomes grey"
+            f"{alike}{advice}")  # fmt: skip
+
+
 def similarity(image: Array, picture: Array) -> float:
     """Return the SSIM of two luminances (H, W), each divided by its mean, by scikit-image. The maximum of the divided
     picture is data_range.

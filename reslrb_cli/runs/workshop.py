@@ -23,7 +23,6 @@ from reslrb_cli.glasses import Glass
 from reslrb_cli.lens.solid import Sheet
 from reslrb_cli.lens.surface import similarity
 from reslrb_cli.records.images import luminance
-from reslrb_cli.report.page.workshop import shown_ssim
 from reslrb_cli.scene.graph import is_one_of
 from reslrb_cli.scene.images import read_image
 from reslrb_cli.scene.rays import brightness
@@ -248,16 +247,13 @@ def tolerances(
     target: Array,
     spp: int,
     say: Callable[[str], None] = lambda _: None,
-    original: Array | None = None,
     keep: Callable[[str, Array], None] = lambda name, image: None,
 ) -> dict[str, dict[str, Any]]:
     """Return `figures` by name, for the image `planned` and for the image of each error. `target` (H, W) is the
     luminance for comparison.
 
     A rotation shifts the whole picture by `shift` (columns, rows) in pixels. The shift is removed before the
-    comparison. `original` (H, W) is the picture before its dark parts were raised. If `original` is given,
-    `ssim_of_picture` is the SSIM of the image and `original`. `keep` receives the name and the luminance (H, W) of each
-    image.
+    comparison. `keep` receives the name and the luminance (H, W) of each image.
     """
     plan, both = bench.plan, bench.solid_parts()
     found: dict[str, dict[str, Any]] = {}
@@ -269,8 +265,6 @@ def tolerances(
             rows, columns = (float(value) for value in shift_between(image, planned))
             image = scipy.ndimage.shift(image, (-rows, -columns), order=1)
             entry["shift"] = [columns + 0.0, rows + 0.0]  # no -0
-        if original is not None:
-            entry["ssim_of_picture"] = figures(image, original)["ssim"]
         found[name] = figures(image, target) | {"spp": spp} | entry
         moved = f", shifted by {np.hypot(*entry['shift']):.2g} pixels" if turned else ""
         say(f"{name}: SSIM {found[name]['ssim']:.3f}, {100 * found[name]['inside']:.3g} % of the light inside{moved}")
@@ -316,7 +310,8 @@ def add_sheet(
     original = original_of(plan, wanted)
     numbers["thrown"] = figures(thrown, wanted)
     if original is not None:
-        numbers["thrown"]["ssim_of_picture"] = figures(thrown, original)["ssim"]
+        for name, image in (("ssim_of_picture", thrown), ("ssim_of_target", wanted)):
+            numbers["thrown"][name] = figures(image, original)["ssim"]
     if {plan.face, plan.receiver} <= {shape.id() for shape in scene.shapes()}:
         numbers["light"] = where_light_goes(scene, scene.sensors()[sensor], plan, wanted)
         numbers["setup"] = setup_of(scene, scene.sensors()[sensor], plan, sheet, wanted)
@@ -341,7 +336,7 @@ def add_tolerances(
     def keep(name: str, image: Array) -> None:
         pictures[name] = as_picture(image, shown, inside)
 
-    found = tolerances(bench, planned, wanted, spp, say, original, keep)
+    found = tolerances(bench, planned, wanted, spp, say, keep)
     setup = numbers.get("setup")
     deviations = {"turn": TURN, "index": INDEX}
     if setup is not None:
@@ -405,7 +400,7 @@ def allowed_errors(
     for name, (prefix, unit, deviation) in kinds.items():
         entries = [entry for key, entry in found.items() if key.startswith(prefix)]
         if entries and deviation:
-            fall = max(shown_ssim(planned) - shown_ssim(entry) for entry in entries)
+            fall = max(planned["ssim"] - entry["ssim"] for entry in entries)
             value, tolerance = allowed_error(fall, deviation), TOLERANCES[name]
             at_least = fall < ALLOWED_LOSS
             passes = None if at_least and value < tolerance else value >= tolerance

@@ -13,6 +13,7 @@ import pytest
 from cli.tiny import done
 from click.testing import CliRunner
 from PIL import Image
+from skimage.metrics import structural_similarity
 from turns import a_few
 
 from reslrb_cli.cli.lens import command, read_luminance, show_stages
@@ -137,7 +138,8 @@ def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str
     assert re.search(r" x .* mm, .* cm\^3, least thickness .* mm; \d+ triangles\nface: .*cutter", result.output)
     preview = np.asarray(Image.open(folder / "preview.png").convert("L"), float)
     assert np.corrcoef(preview.ravel(), wanted.ravel())[0, 1] > 0.8, "another picture, or turned"
-    likeness = re.search(r"preview.png: the caustic at the start; SSIM with the picture (\d\.\d\d)\n", result.output)
+    assert "contrast of at most" not in result.output  # nothing of the picture is below the floor
+    likeness = re.search(r"preview.png: the caustic at the start; SSIM with the target (\d\.\d\d)\n", result.output)
     assert likeness is not None
     assert float(likeness[1]) > 0.8
     heights = read_image(folder / "start.exr", "linear", signed=True)[:, :, 0]
@@ -152,6 +154,25 @@ def test_the_start_casts_the_picture_upright_with_the_right_brightness(kind: str
     assert max(likeness[1:]) < 0.7
     assert image.sum() == pytest.approx(target.sum(), rel=0.03)  # brightness matches by itself
     assert load_configured(load(folder / "lens.yaml")) is not None
+
+
+@pytest.mark.parametrize("is_white", [True, False])
+def test_the_command_tells_how_much_of_the_contrast_a_lens_can_show(is_white: bool, tmp_path: Path) -> None:
+    """The ground of a white logo becomes grey: the target, and a perfect lens, hardly resemble the picture."""
+    word = np.zeros((24, 24), bool)
+    word[6:18, 9:12] = word[14:18, 9:18] = True
+    Image.fromarray(np.where(word == is_white, 255, 0).astype(np.uint8)).save(tmp_path / "p.png")
+    args = [str(tmp_path / "p.png"), "-o", str(tmp_path / "lens"), "--pixels", "24", "--floor", "0.2"]
+    result = CliRunner().invoke(command, args, catch_exceptions=False)
+    told = re.search(r"\ncontrast of at most 5 to 1: (\S+) % of the picture is darker, and becomes grey; "
+                     r"the target has an SSIM of (\S+) with the picture(.*)\n", result.output)  # fmt: skip
+    assert told is not None
+    assert float(told[1]) == pytest.approx(100 * np.mean(word != is_white), rel=0.06)
+    assert (told[3] != "") == is_white
+    target, shown = (read_image(tmp_path / f"lens/{name}.exr")[3:-3, 3:-3, 1] for name in ("target", "picture"))
+    alike = structural_similarity(target, shown, data_range=shown.max())
+    assert float(told[2]) == pytest.approx(alike, abs=0.006)
+    assert (alike < 0.5) == is_white
 
 
 BAD = {

@@ -261,7 +261,11 @@ def test_the_page_of_a_run_has_the_figures_for_the_maker(
     assert [page.count(words) for words in ("the lens, seen from", "the original picture", "the caustic, as")] == [
         4, 3, 2,
     ]  # fmt: skip
-    assert f"<td>{number(thrown['ssim_of_picture'], 3)} with the original picture" in page
+    with_target = structural_similarity(divided[1], picture, data_range=picture.max())
+    assert thrown["ssim_of_target"] == pytest.approx(with_target, abs=1e-5)
+    assert f"<td>{number(thrown['ssim'], 3)}: 1 for equal pictures" in page
+    shown = [number(thrown[f"ssim_of_{name}"], 3) for name in ("picture", "target")]
+    assert f"<td>{shown[0]}; the target, with dark parts raised, has {shown[1]}" in page
     setup = numbers["setup"]
     assert (setup["lit_side"], setup["light_distance"], setup["through"]) == ("back", "parallel", False)
     assert setup["receiver_distance"] == pytest.approx(200, rel=1e-4)

@@ -54,7 +54,7 @@ def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str
     shown = [*CAPTIONS, light]
     large = [_picture(name, CAPTIONS.get(name, f"the caustic in {name}"), pictures) for name in shown]
     views = [_picture(name, f"the {kind}, {caption}", pictures) for name, caption in VIEWS.items()]
-    off = [_picture(name, f"{name}: SSIM {number(shown_ssim(entry), 3)}", pictures)
+    off = [_picture(name, f"{name}: SSIM {number(entry['ssim'], 3)}", pictures)
            for name, entry in found.items() if name not in (*shown, "as planned")]  # fmt: skip
     return {
         "Picture": (
@@ -70,14 +70,6 @@ def parts(numbers: Mapping[str, Any], pictures: Mapping[str, Array]) -> dict[str
         ),
         "Deviations": lay_out("gallery", [each for each in off if each]) + lay_out("workshop.deviations", found),
     }  # fmt: skip
-
-
-def shown_ssim(entry: Mapping[str, Any]) -> float:
-    """Return the SSIM that the sheet shows. The SSIM refers to the original picture if that picture is known, otherwise
-    to the target.
-    """
-    value = entry.get("ssim_of_picture")
-    return float(entry["ssim"] if value is None else value)
 
 
 def _picture(name: str, caption: str, pictures: Mapping[str, Array]) -> Any:
