@@ -9,11 +9,13 @@ import signal
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from cli.tiny import ended, measured
 
-from reslrb_cli.cli import terminal
+from reslrb_cli.cli import gradcheck, terminal
 from reslrb_cli.records.measurements import GradcheckRecord, Kind, Reference, Verdict
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -172,3 +174,18 @@ def test_a_budget_too_small_for_anything_is_no_success(capsys: pytest.CaptureFix
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2] == "0 of 6 comparisons hold, 0 fail, 6 leave the question open"
     assert lines[-1] == "open: 6 not measured: the budget was spent; allow more with --budget"
+
+
+@pytest.mark.parametrize(
+    ("holds", "end"),
+    [
+        ((True, True), "2 of 2  holds"),
+        ((True, None), "1 of 2, 1 open  holds"),
+        ((None, False), "0 of 2, 1 open  FAILS"),
+    ],
+)
+def test_a_case_holds_unless_a_comparison_fails(holds: tuple[bool | None, ...], end: str) -> None:
+    rows: list[Any] = [
+        SimpleNamespace(holds=each, z_max=None, relative_l2=None, relative_l2_limit=None) for each in holds
+    ]
+    assert gradcheck._case_line("furnace", rows).endswith(end)

@@ -13,7 +13,7 @@ from cli.tiny import reslrb, settings
 from click.testing import Result
 from kit import scene, sensor, shape
 
-from reslrb_cli.cli.init import PIXELS, choose_size
+from reslrb_cli.cli.init import PIXELS, _note, choose_size
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import TargetConfig
@@ -470,3 +470,11 @@ def test_the_size_of_a_first_run(film, photo, fixed, size):
             choose_size(film, stored, fixed)
     else:
         assert choose_size(film, stored, fixed) == size
+
+
+@pytest.mark.parametrize(
+    ("share", "words"), [(0.0049, "not seen itself"), (0.0051, "1 % of the picture"), (1.0, "100 % of the picture")]
+)
+def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> None:
+    info = SimpleNamespace(value=None, shape=(), remark="a remark")
+    assert _note(SimpleNamespace(info=info, share=share)) == f"{words}, a remark"

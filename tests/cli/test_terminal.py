@@ -17,12 +17,14 @@ import sys
 import termios
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from cli.test_nonfinite import CONFIG, SCENE
 from cli.tiny import outcome
 from records.test_metrics import make_record
+from tqdm import tqdm
 
 from reslrb_cli.cli import lens
 from reslrb_cli.cli.lens import show_stages
@@ -234,6 +236,15 @@ def test_log_lines_appear_once_above_the_bar(monkeypatch):
     assert text.count("beware") == 1
     assert re.search(r"(^|[\r\n])beware of \\x1b\[31m\r\n", text)
     assert "\x1b[31m" not in text
+
+
+def test_the_remaining_time_of_a_resumed_run(monkeypatch):
+    """Iterations of 2 s. The time before the first one of this process does not count."""
+    progress = Progress(10, quiet=True, meter=make_meter(1), done=5)
+    progress._bar = SimpleNamespace(format_interval=tqdm.format_interval)
+    for number, seconds in ((5, 8), (6, 6)):
+        record = make_record(iteration=number, elapsed_s=100.0 + 2 * number, step_ms=2000.0, codegen_ms=0.0)
+        assert progress._left(record) == f"00:0{seconds} left"
 
 
 def test_a_terminal_that_changes_width(monkeypatch):

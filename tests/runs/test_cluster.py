@@ -273,6 +273,26 @@ def test_a_worker_with_other_tables_is_refused(monkeypatch: pytest.MonkeyPatch) 
         engine.Standing({}, {}, {}).take(SimpleNamespace())
 
 
+class _Noted:
+    """Context that notes when it is taken."""
+
+    def take(self, state: object) -> None:
+        taken.append(state)
+
+
+taken: list[object] = []
+
+
+def test_a_context_is_taken_again_after_one_that_failed(me: SimpleNamespace) -> None:
+    """The failed one may have changed a part of the state."""
+    me.plugins["reslrb"] = workload = calls.Workload({"a": b"one"}, reads)
+    taken.clear()
+    for context, number in ((_Noted(), 1), (_Noted(), 1), (_Broken(), 1), (_Noted(), 2)):
+        with suppress(ValueError):
+            calls.perform(workload.key, pickle.dumps(context), str.upper, ())
+        assert len(taken) == number
+
+
 @pytest.mark.parametrize(("shown", "seen"), [("3,5", "5"), ("7", "7"), ("0,1,2", "1")])
 def test_each_worker_sees_one_gpu(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, shown: str, seen: str) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)

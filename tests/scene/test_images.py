@@ -15,6 +15,7 @@ import pytest
 from kit import profile_of
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import images
 from reslrb_cli.scene.images import decode_srgb, orientation_of, photo_lines, read_image, read_photo, read_stored
 from reslrb_cli.scene.proposal import write_smaller
 
@@ -604,3 +605,21 @@ def test_values_are_at_most_the_maximum(data, is_whole, tmp_path):
     else:
         with pytest.raises(ConfigError, match=r"a\.pgm: is not a readable image"):
             read_image(tmp_path / "a.pgm")
+
+
+@pytest.mark.parametrize("restart", range(0xD0, 0xD8))
+def test_every_restart_of_a_jpeg_is_skipped(restart):
+    start = bytes([0xFF, 0xD8, 0xFF, 0xE0, 0, 4, 0xFF, 0xD9])  # the end inside of a segment does not count
+    assert images._ends(start + bytes([0xFF, restart, 0xFF, 0, 0xFF, 0xD9]))
+    assert not images._ends(start + bytes([0xFF, restart, 0xFF, 0]))
+
+
+def test_alpha_is_a_share(tmp_path):
+    pixels = np.full((2, 3, 4), 0.5, np.float32)
+    pixels[0, :, 3] = 0, 0.25, 2
+    write(tmp_path / "a.exr", pixels)
+    write(tmp_path / "a.png", np.uint8(np.minimum(pixels, 1) * 255))
+    for name in ("a.exr", "a.png"):
+        photo = read_photo(tmp_path / name)
+        np.testing.assert_allclose(photo.alpha[0], [0, 0.25, 1], atol=1 / 255)
+        assert photo.transparent[0].tolist() == [True, False, False]
