@@ -10,6 +10,10 @@ the image changes by about 3 %. Then neither rounding nor curvature dominates th
 
 At a bound, the ends are clipped, and the difference is divided by the distance of the clipped ends.
 
+Every iteration has its own samples, in two halves. Their difference shows the noise e of H d. Noise along H d changes
+lambda by the same share. Noise across H d turns the next d away, which lowers lambda by |e|^2 / (2 lambda^2). An
+iteration whose two shares exceed `TOLERANCE` doubles the samples of the next one, up to those of a step.
+
 The gradient is divided by lambda and by the number of parameters. If the diagonal blocks of a positive matrix have norm
 1, the matrix norm is at most the number of blocks. A rate of 1 is Newton's step along the steepest direction. Gradient
 descent converges for learning rates below 2, as long as the curvature keeps its initial value.
@@ -97,8 +101,10 @@ def see_images(problem: Problem, spp: int | None = None, round: int = 0, purpose
     return images
 
 
-#: Differences of gradients for the largest curvature.
-POWER_ITERATIONS = 8
+#: Differences of gradients for the largest curvature, and the relative error of the curvature that steps tolerate.
+POWER_ITERATIONS, TOLERANCE = 8, 0.05
+#: Part of a step's samples in each half of the first difference.
+FIRST_PART = 16
 
 
 def measure_curvatures(problem: Problem) -> list[Scaled]:
@@ -108,16 +114,15 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
     A parameter without an effect on the image keeps its units. An interrupt stops the measurement before the next
     rendering (`Problem.stop_if_interrupted`). The values are then not those of the start.
     """
-    optimizer, measured = problem.optimizer, []
+    optimizer, measured, spp = problem.optimizer, [], problem.config.run.spp
     starts = {key: dr.detach(optimizer[key]) for key in problem.selection.keys}
     problem.apply()
-    base = see_images(problem)
     for key, start in starts.items():
         variable = optimizer.variable(key)
         v = variable.from_scene(start)
-        gradient = finite(_gradient_at(problem, key, v))
+        gradient = finite(_gradients_at(problem, key, v, spp, [0])[0])
         row = Scaled(key, gradient.size, rms(np.array(start)), rms(gradient))
-        found = _steepest(problem, key, v, gradient, base)
+        found = _steepest(problem, key, v, gradient)
         optimizer.set_value(key, start)
         if found > 0:
             unit = replace(variable, gain=1 / (found * len(starts)))
@@ -130,10 +135,12 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
     return measured
 
 
-def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequence[Array]) -> float:
+def _steepest(problem: Problem, key: str, v: Any, gradient: Array) -> float:
     """Return the loss's largest curvature in `v`, the optimiser's variable of `key`. Return 0 if `v` has no visible
-    effect. The images `base` show the start.
+    effect. The scene must have the values of `v`.
     """
+    counts = _sample_counts(problem)
+    spp, base = 2 * counts[0], see_images(problem, 2 * counts[0])
     size = math.sqrt(sum(float(np.square(finite(image)).sum()) for image in base))
     direction = gradient / (np.linalg.norm(gradient) or 1.0)
     step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
@@ -150,9 +157,12 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
         for end in pair:
             problem.stop_if_interrupted()
             problem.apply({key: variable.to_scene(end)})
-            images.append(see_images(problem))
+            images.append(see_images(problem, spp))
         halves = (0.5 * finite(a - b) for a, b in zip(*images, strict=True))
         change = math.sqrt(sum(float(np.square(half).sum()) for half in halves)) / (size or 1.0)
+        if change == 0 and spp < problem.config.run.spp:  # few samples may miss the effect
+            spp = problem.config.run.spp
+            continue
         if not 0 < change < math.inf:
             step *= 1e3 if change == 0 else 1e-3
             continue
@@ -162,35 +172,53 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array, base: Sequenc
     else:
         return 0.0
     found = 0.0
-    for _ in range(POWER_ITERATIONS):
+    for number in range(POWER_ITERATIONS):
         pair, wide = ends()
-        rows = [_gradient_at(problem, key, end) for end in pair]
-        bent = finite(rows[0] - rows[1]) / (wide or 1.0)
-        if not np.isfinite(rows).all(axis=0).any():  # this pair of gradients tells nothing
+        rounds = [2 * number + 1, 2 * number + 2]
+        rows = np.stack([_gradients_at(problem, key, end, counts[0], rounds) for end in pair])
+        if not np.isfinite(rows).all(axis=(0, 1)).any():  # this pair of gradients tells nothing
             continue
+        halves = finite(rows[0] - rows[1]) / (wide or 1.0)
+        bent, noise = halves.mean(axis=0), (halves[0] - halves[1]) / 2
         before, found = found, float(np.linalg.norm(bent))
         if not 0 < found < math.inf:
             return 0.0
         direction = bent / found
         if before:  # with the same change of the image as before
             step *= math.sqrt(before / found)
+        if len(counts) > 1 and abs(noise @ direction) / found + 0.5 * (noise @ noise) / found**2 > TOLERANCE:
+            del counts[0]
     return found
 
 
-def _gradient_at(problem: Problem, key: str, v: Any) -> Array:
-    """Return dL/dv as a flat array, at the value `v` of the optimiser's variable for `key`. Every call uses the same
-    samples. Values that are not finite are NaN.
+def _sample_counts(problem: Problem) -> list[int]:
+    """Return the possible samples per pixel of one half of a difference, ascending. The largest is half of a step's, or
+    a step's if those cannot be halved.
+    """
+    spp, multiple = problem.config.run.spp, problem.samples_per_pass or 1
+    batches = problem.config.step_options().get("batches", 1)
+    parts = [spp // part for part in (FIRST_PART, 8, 4, 2) if spp % (part * batches) == 0]
+    return [part for part in parts if part // batches % min(multiple, part // batches) == 0] or [spp]
+
+
+def _gradients_at(problem: Problem, key: str, v: Any, spp: int, rounds: Sequence[int]) -> Array:
+    """Return dL/dv (R, N) at the value `v` of the optimiser's variable for `key`, for each of the `rounds`. A round
+    always has the same samples. Values that are not finite are NaN.
     """
     problem.stop_if_interrupted()
     optimizer = problem.optimizer
     variable = optimizer.variable(key)
     optimizer.set_value(key, variable.to_scene(v))
     problem.apply()
-    sample_gradient(problem, problem.integrator, 0, _PURPOSE, problem.config.run.spp)
-    problem.regularize()
-    row = np.array(variable.chain(v, optimizer.gradient(key)), dtype=np.float64).ravel()
-    take_gradient(problem)
-    return np.where(np.isfinite(row), row, np.nan)
+    rows = []
+    for round in rounds:
+        problem.stop_if_interrupted()
+        sample_gradient(problem, problem.integrator, round, _PURPOSE, spp)
+        problem.regularize()
+        row = np.array(variable.chain(v, optimizer.gradient(key)), dtype=np.float64).ravel()
+        take_gradient(problem)
+        rows.append(np.where(np.isfinite(row), row, np.nan))
+    return np.array(rows)
 
 
 def _like(value: Any, row: Array) -> Any:

@@ -142,8 +142,8 @@ PLACES = {
     },
     "auto, moving": {"step update exposed_images"},
     "sgd": {
-        "step measure_curvatures see_images", "measure_curvatures _gradient_at sample_gradient",
-        "measure_curvatures _steepest see_images", "_steepest _gradient_at sample_gradient",
+        "measure_curvatures _gradients_at sample_gradient", "measure_curvatures _steepest see_images",
+        "_steepest _gradients_at sample_gradient",
     },
     "exposure": {"find_ambiguous _row see_images"},
 }  # fmt: skip

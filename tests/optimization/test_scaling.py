@@ -85,6 +85,50 @@ def test_the_curvature_is_the_same_at_bounds(start, bounds, target, llvm, tmp_pa
     np.testing.assert_array_equal(np.array(problem.optimizer["albedo"]), np.float32(values[start]))
 
 
+@pytest.mark.parametrize(("size", "noise", "most"), [
+    (1, 0.02, 4), (1, 0.6, 32), (400, 0.02, 4), (400, 0.6, 4), (400, 1.2, 16), (400, 3.0, 32),
+])  # fmt: skip
+def test_the_samples_of_a_curvature_follow_from_its_noise(noise, most, size, llvm, tmp_path, monkeypatch):
+    """The noise of H d is `noise` / sqrt(spp). One half of a difference starts with 4 of 64 samples. In at least 18 of
+    20 measurements, the curvature of 1 is within twice the tolerance, unless all samples are too few.
+    """
+    problem = make_problem(tmp_path, sets=[DESCENT, "run.spp=64", "run.adjoint=correlated"])
+    problem.optimizer.set_value("albedo", dr.full(mi.TensorXf, 0.5, (1, 1, size)))
+    problem.apply()
+    curved, found, counts = np.r_[1.0, 0.5 * np.ones(size - 1)], [], []
+
+    def gradients(problem, key, v, spp, rounds):
+        counts[-1].append(spp)
+        errors = [np.random.default_rng([spp, round, len(found)]).normal(size=size) for round in rounds]
+        moved = np.array(v, dtype=np.float64).ravel() - 0.5
+        # H d has this noise at both ends of d, with opposite signs.
+        side = np.sign(moved @ np.r_[1.0, np.zeros(size - 1)]) * np.linalg.norm(moved)
+        return np.array([curved * moved + side * noise / np.sqrt(spp * size) * error for error in errors])
+
+    monkeypatch.setattr(sensitivity, "_gradients_at", gradients)
+    monkeypatch.setattr(sensitivity, "see_images", lambda problem, spp: [np.array(problem.selection.params["albedo"])])
+    for _ in range(20):
+        counts.append([])
+        problem.apply()
+        start = np.r_[1.0, np.full(size - 1, 0.02)]
+        found.append(sensitivity._steepest(problem, "albedo", problem.optimizer["albedo"], start))
+    assert np.median([max(each) for each in counts]) == most
+    assert all(each == sorted(each) and each[0] == 4 for each in counts)
+    if most < 32:
+        close = np.abs(np.array(found) - 1) < 2 * sensitivity.TOLERANCE
+        assert close.sum() >= 18
+
+
+@pytest.mark.parametrize(("sets", "counts"), [
+    (["run.spp=64", "run.adjoint=batched"], [4, 8, 16, 32]), (["run.spp=64", "run.adjoint=correlated"], [4, 8, 16, 32]),
+    (["run.spp=16", "run.adjoint=batched"], [4, 8]), (["run.spp=12", "run.adjoint=batched"], [12]),
+    (["run.spp=12", "run.adjoint=correlated"], [3, 6]), (["run.spp=3", "run.adjoint=correlated"], [3]),
+])  # fmt: skip
+def test_a_part_of_the_samples_has_whole_batches_and_passes(sets, counts, llvm, tmp_path):
+    problem = make_problem(tmp_path, sets=[DESCENT, *sets])
+    assert sensitivity._sample_counts(problem) == counts
+
+
 def test_only_gradient_descent_uses_curvature():
     with pytest.raises(ConfigError, match=r"optimizer\.scale: curvature needs type: sgd"):
         load(CONFIG, ["optimizer={type: adam, scale: curvature}"])
