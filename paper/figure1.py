@@ -63,13 +63,13 @@ def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dic
     for kind, count in ((half, 1), (naive, plan.seeds), (ours, plan.seeds), (many, plan.many_seeds), (failing, 1)):
         say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
         series = f"figure1, {'ours' if kind.by == OWN else 'naive'}, {kind.spp} spp"
-        sample(kind, count, config, pictures["adjoint"], series, plan.limit)
+        sample(kind, count, config, pictures, series, plan.limit)
         if kind.end is not None and kind is not failing:
             raise kind.end
     growth = ((naive.arrays_mib or 0) - (half.arrays_mib or 0)) / (naive.spp - half.spp)
     asked_mib = (naive.arrays_mib or 0) + growth * (plan.many_spp - naive.spp)
     kinds = [naive, ours, many, failing]
-    return judge(plan, kinds, asked_mib), panels(pictures, kinds, plan.limit)
+    return judge(plan, kinds, asked_mib), panels(pictures.target, pictures.initial, kinds, plan.limit)
 
 
 def judge(plan: Plan, kinds: list[Kind], asked_mib: float) -> dict[str, Any]:
@@ -79,24 +79,21 @@ def judge(plan: Plan, kinds: list[Kind], asked_mib: float) -> dict[str, Any]:
     naive, ours, many, failing = kinds
     comparisons = compare([(ours, naive), (many, naive), (many, ours)])
     noise = fall(ours.rows, many.rows, float(np.sqrt(many.spp / ours.spp)))
-    verdicts = [row["verdict"] for row in (*comparisons, noise)]
     does_not_fit = failing.end is not None and failing.end.status is BenchStatus.OUT_OF_MEMORY
     return {
-        "plan": asdict(plan),
-        "gradients": [kind.record(many.rows.mean(0)) for kind in kinds],
-        "naive_at_many_spp_mib": asked_mib,
-        "comparisons": comparisons,
-        "noise": noise,
-        "holds": does_not_fit and all(verdict is Verdict.HOLDS for verdict in verdicts),
-    }
+        "plan": asdict(plan), "gradients": [kind.record(many.rows.mean(0)) for kind in kinds],
+        "naive_at_many_spp_mib": asked_mib, "comparisons": comparisons, "noise": noise,
+        "holds": does_not_fit and all(row["verdict"] is Verdict.HOLDS for row in (*comparisons, noise)),
+    }  # fmt: skip
 
 
-def panels(pictures: dict[str, np.ndarray], kinds: list[Kind], limit: int) -> list[list[tuple[str, np.ndarray]]]:
+def panels(
+    target: np.ndarray, initial: np.ndarray, kinds: list[Kind], limit: int
+) -> list[list[tuple[str, np.ndarray]]]:
     """Return the panels of the picture: target, caustic, and one gradient of each kind from one seed."""
     naive, ours, many, failing = kinds
-    shape, white = np.shape(many.samples)[1:], float(np.quantile(pictures["target"], 0.999)) or 1.0
+    shape, white = np.shape(many.samples)[1:], float(np.quantile(target, 0.999)) or 1.0
     end = signed_end(many.rows[0].reshape(shape).sum(-1))
-    target, caustic = (encode(pictures[name] / white) for name in ("target", "initial"))
 
     def shown(kind: Kind) -> tuple[str, np.ndarray]:
         if kind.samples is None:
@@ -104,6 +101,6 @@ def panels(pictures: dict[str, np.ndarray], kinds: list[Kind], limit: int) -> li
         return f"{kind.label}: {kind.arrays_mib:.0f} MiB", colored(kind.samples[0].sum(-1), end)
 
     return [
-        [("target", target), shown(naive), shown(failing)],
-        [("caustic at the start", caustic), shown(ours), shown(many)],
+        [("target", encode(target / white)), shown(naive), shown(failing)],
+        [("caustic at the start", encode(initial / white)), shown(ours), shown(many)],
     ]

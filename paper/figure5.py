@@ -67,7 +67,7 @@ def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dic
     def taken(name: str, by: str, count: int, series: str) -> Kind:
         kind = Kind(name, plan.spp, by)
         say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
-        sample(kind, count, config, pictures["adjoint"], f"figure5, {series}")
+        sample(kind, count, config, pictures, f"figure5, {series}")
         if kind.end is not None:
             raise kind.end
         return kind
@@ -75,14 +75,11 @@ def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dic
     sampled = {"naive AD": "walk_ad", label: OWN, "prb": "prb"}
     kinds = [taken(name, by, plan.seeds, by) for name, by in sampled.items()]
     exact = [taken(f"reslrb:{name}", name, 1, "walk_ad") for name in EXACT]
-    height, width = pictures["adjoint"].shape[:2]
-    found = {
-        "plan": asdict(plan),
-        "film": [width, height],
-        "max_depth": config.integrator.max_depth,
-        "left_out": float(np.mean(~pictures["adjoint"].any(-1))),
-    }
-    return found | judge(kinds, exact), panels(pictures["initial"], kinds)
+    [adjoint] = pictures.arrays["adjoints"]
+    height, width, _ = adjoint.shape
+    found = {"plan": asdict(plan), "film": [width, height], "max_depth": config.integrator.max_depth,
+             "left_out": float(np.mean(~adjoint.any(-1)))}  # fmt: skip
+    return found | judge(kinds, exact), panels(pictures.initial, kinds)
 
 
 def judge(kinds: list[Kind], exact: list[Kind]) -> dict[str, Any]:
@@ -91,11 +88,8 @@ def judge(kinds: list[Kind], exact: list[Kind]) -> dict[str, Any]:
     comparisons = compare([(ours, naive), (ours, prb)])
     comparisons += [compared(kind, naive, compare_equal_seeds(kind.rows, naive.rows[:1], CLOSE)) for kind in exact]
     mean = (naive.rows.mean(0) + ours.rows.mean(0)) / 2
-    return {
-        "gradients": [kind.record(mean) for kind in kinds],
-        "comparisons": comparisons,
-        "holds": all(row["verdict"] is Verdict.HOLDS for row in comparisons),
-    }
+    return {"gradients": [kind.record(mean) for kind in kinds], "comparisons": comparisons,
+            "holds": all(row["verdict"] is Verdict.HOLDS for row in comparisons)}  # fmt: skip
 
 
 def z_map(naive: Kind, ours: Kind) -> np.ndarray:

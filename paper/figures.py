@@ -30,6 +30,8 @@ from reslrb_cli.records.measurement_files import Origin
 SEEDS = {"figure1": (32, 12), "figure5": (24, 8)}
 #: What is asked of `reslrb bench`, unless further options say otherwise.
 BENCH = "--budget 300 --integrators ptracer,reslrb:reservoir,reslrb:stack --set integrator.rr_depth=100000"
+HELPS = {"figure1": "a caustic and the gradient of its glass", "figure5": "the gradient of a room's floor",
+         "figure6": "time and memory against depth; further options go to `reslrb bench`"}  # fmt: skip
 BUILD, DEPTHS = ROOT / "build" / "paper", ["--max-depth", "128"]
 
 
@@ -37,9 +39,7 @@ def main(arguments: list[str]) -> int:
     """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(prog="scripts/paper", description=__doc__)
     figures = parser.add_subparsers(dest="name", required=True)
-    helps = {"figure1": "a caustic and the gradient of its glass", "figure5": "the gradient of a room's floor",
-             "figure6": "time and memory against depth; further options go to `reslrb bench`"}  # fmt: skip
-    for name, text in helps.items():
+    for name, text in HELPS.items():
         figure = figures.add_parser(name, help=text)
         figure.add_argument("-o", dest="folder", type=Path, default=BUILD, help="default: build/paper")
         figure.set_defaults(room=None, sets=[])
@@ -74,6 +74,8 @@ def _figure(options: argparse.Namespace) -> int:
     """Measure, check and draw a figure of gradients. Return the exit code."""
     from make_figures import write_panels
 
+    from paper.gradients import VARIANT
+
     def say(line: str) -> None:
         print(f"{options.name}: {line}", file=sys.stderr, flush=True)
 
@@ -83,10 +85,8 @@ def _figure(options: argparse.Namespace) -> int:
     # The command that makes the figure again does not name the user's folder of the room.
     words = ["scripts/paper", options.name, *(["ROOM"] if options.room else []), "--seeds", str(options.seeds)]
     words += [word for setting in options.sets for word in ("--set", setting)]
-    variant = "llvm_ad_rgb"
-    origin = json.loads(Origin(device_name(variant), variant, words).to_json()) | code_state()
-    record = {"origin": origin} | record
-    text = json.dumps(record, indent=1)
+    origin = json.loads(Origin(device_name(VARIANT), VARIANT, words).to_json()) | code_state()
+    text = json.dumps({"origin": origin} | record, indent=1)
     (options.folder / f"{options.name}.json").write_text(text + "\n", encoding="utf-8")
     write_panels(panels, options.folder / f"{options.name}.png")
     print(page.FIGURES[options.name](json.loads(text)))

@@ -9,35 +9,30 @@ parameter, at the parameters' initial values, through the first sensor.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from reslrb_cli.backend.installation import python_command
 from reslrb_cli.backend.variant import set_variant
-from reslrb_cli.config.integrators import Prb, Ptracer, ReslrbConfig, WalkAdConfig
-from reslrb_cli.config.loader import dump, loads
+from reslrb_cli.config.integrators import ReslrbConfig
+from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
-from reslrb_cli.measure.gradients import Case
+from reslrb_cli.measure.engine import start_process
 from reslrb_cli.measure.methods import NEVER
 from reslrb_cli.measure.participants import ALIKE
-from reslrb_cli.measure.processes import Begun, Ended, Process
-from reslrb_cli.optimization.assemble import assemble, assemble_scene
-from reslrb_cli.records.clock import peak_mib, reset_peak
+from reslrb_cli.measure.processes import Ended
+from reslrb_cli.measure.steps import adjoint
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.views import target_arrays
 from reslrb_cli.records.measurements import Comparison, Reference, Verdict
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.tonemap import color_map
 from reslrb_cli.scene.visibility import interior, sees_specular
-from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import jackknife_variance
 
 #: On a GPU the address space of a process says nothing about the memory of its arrays.
@@ -46,6 +41,18 @@ VARIANT = "llvm_ad_rgb"
 OWN = "own"
 #: Confidence of the interval of `fall`, and the relative half width of its test above which the ratio is not known.
 CONFIDENCE, WIDEST = 0.95, 0.2
+
+
+@dataclass
+class Pictures:
+    """The target and the initial image (H, W, C), and the arrays of a process (`steps.Sampler`) with dL/dI at the
+    initial image. `shape` is that of the first parameter.
+    """
+
+    target: np.ndarray
+    initial: np.ndarray
+    arrays: dict[str, np.ndarray]
+    shape: tuple[int, ...]
 
 
 @dataclass
@@ -78,14 +85,11 @@ class Kind:
         """Return the figures of this kind. The noise is relative to the gradient `mean` (P,)."""
         count = 0 if self.samples is None else len(self.samples)
         return {
-            "gradient": self.name,
-            "spp": self.spp,
-            "seeds": count,
-            "relative_noise": relative_noise(self.rows, mean) if count > 1 else None,
-            "arrays_mib": self.arrays_mib,
+            "gradient": self.name, "spp": self.spp, "seeds": count,
+            "relative_noise": relative_noise(self.rows, mean) if count > 1 else None, "arrays_mib": self.arrays_mib,
             "status": "ok" if self.end is None else self.end.status.value,
             "reason": None if self.end is None else self.end.reason,
-        }
+        }  # fmt: skip
 
 
 def own_label(config: Config) -> str:
@@ -103,103 +107,62 @@ def own_label(config: Config) -> str:
 
 
 def comparable(config: Config, by: str) -> Config:
-    """Return the experiment with another integrator. The gradients of all these integrators have the same expectation.
-
-    The values of `by` are:
-
-    - `own`: the experiment's `reslrb`
-    - `ptracer`: naive AD of the stock walk
-    - `walk_ad`: naive AD of our walk
-    - `prb`
-    - the name of an estimator
+    """Return the experiment with another integrator: `own` for that of the experiment, `ptracer` or `walk_ad` for naive
+    AD of the stock walk or of ours, `prb`, or the name of an estimator. All have the same expectation.
 
     No integrator uses Russian roulette, because naive AD does not differentiate its decision.
     """
     assert isinstance(config.integrator, ReslrbConfig), "checked by `own_label`"
     own = config.integrator.plain()
-    alike: dict[str, Any] = {**ALIKE[Reference.PTRACER], "rr_depth": NEVER}
-    shared: dict[str, Any] = {"max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
-    if by == "ptracer":
-        return config.model_copy(update={"integrator": Ptracer(type="ptracer", **shared)})
-    if by == "prb":
-        return config.model_copy(update={"integrator": Prb(type="prb", **shared)})
-    if by == "walk_ad":
-        options: Any = shared | {"filter_normalization": "detached", "attached": own.attached}
-        return config.model_copy(update={"integrator": WalkAdConfig(type="walk_ad", **options)})
-    other = {} if by == OWN else {"estimator": by}
-    return config.model_copy(update={"integrator": own.model_copy(update=alike | other)})
+    if by in ("ptracer", "prb", "walk_ad"):
+        values = {"type": by, "max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
+        if by == "walk_ad":
+            values |= {"filter_normalization": "detached", "attached": own.attached}
+        return with_integrator(config, values, str(config.source), {})
+    changed: dict[str, Any] = ALIKE[Reference.PTRACER] | {"rr_depth": NEVER} | ({} if by == OWN else {"estimator": by})
+    return config.model_copy(update={"integrator": own.model_copy(update=changed)})
 
 
-def take_pictures(config: Config, spp: int, masked: bool = False) -> dict[str, np.ndarray]:
-    """Return the target and the initial image (H, W, C), and dL/dI at the initial image (`adjoint`). The initial image
-    has `spp` samples per pixel.
+def take_pictures(config: Config, spp: int, masked: bool = False) -> Pictures:
+    """Render the target, and the initial image with `spp` samples per pixel.
 
     If `masked`, dL/dI is 0 where light paths find less light than camera paths. These pixels see smooth specular lobes
     or lie at the film's border.
     """
     set_variant(VARIANT)
     problem = assemble(config.with_exposures_fixed())
-    view = problem.views[0]
+    view, shape = problem.views[0], problem.selection.array(problem.selection.keys[0]).shape
     initial = problem.render(view.sensor, spp, 0, "reference")
-    image = mi.TensorXf(initial)
-    dr.enable_grad(image)
-    dr.backward(view.compare(image))
-    adjoint = np.array(dr.grad(image))
+    mask = np.ones(initial.shape[:2], bool)
     if masked:
         sensor = problem.scene.sensors()[view.sensor]
-        seen = sees_specular(problem.scene, sensor, partly=True)
-        adjoint *= (interior(adjoint.shape, sensor) & ~seen)[:, :, None]
-    return {"target": np.array(view.target), "initial": initial, "adjoint": adjoint}
+        mask = interior(mask.shape, sensor) & ~sees_specular(problem.scene, sensor, partly=True)
+    derivative = adjoint(problem, initial, mask[:, :, None].astype(np.float32))
+    arrays = {"adjoints": derivative[None], **target_arrays(problem.views[:1])}
+    return Pictures(np.array(view.target), initial, arrays, shape)
 
 
-def begin(first: dict[str, Any]) -> Begun:
-    """Begin the work of a process that `sample` starts. Each question contains `seed`, `spp`, and the file `out` for
-    the gradient.
-    """
-    problem = assemble_scene(comparable(loads(first["config"], first["source"]), first["by"]).with_exposures_fixed())
-    selection = problem.selection
-    case = Case(problem.scene, selection.keys, problem.sensors[0], selection)
-    case.weigh(np.load(first["adjoint"])[:, :, : case.weights.shape[2]])
-    key = selection.keys[0]
-
-    def gradient(question: dict[str, Any]) -> dict[str, Any]:
-        reset_peak()
-        found = case.gradient(problem.integrator, question["seed"], question["spp"], step=case.known_step)
-        shape = selection.array(key).shape
-        np.save(question["out"], found[case.places[key]].reshape(shape).astype(np.float32))
-        return {"peak_mib": peak_mib(dr.backend_v(mi.Float))}
-
-    return {}, gradient
-
-
-def sample(kind: Kind, count: int, config: Config, adjoint: np.ndarray, series: str, limit: int | None = None) -> None:
-    """Take `count` gradients with this dL/dI (H, W, C) in a separate process. `limit` bounds the address space of the
-    process in bytes.
+def sample(kind: Kind, count: int, config: Config, pictures: Pictures, series: str, limit: int | None = None) -> None:
+    """Take `count` gradients in a separate process. `limit` bounds the address space of the process in bytes.
 
     Kinds with the same `series` have the same seeds.
     """
-    with tempfile.TemporaryDirectory(prefix="reslrb-paper-") as name:
-        held, out, taken = Path(name) / "adjoint.npy", Path(name) / "gradient.npy", []
-        np.save(held, adjoint)
-        first = {"config": dump(config), "source": str(config.source), "variant": VARIANT, "memory_limit": limit,
-                 "by": kind.by, "adjoint": str(held)}  # fmt: skip
-        code = "from reslrb_cli.measure.processes import run\nrun('paper.gradients:begin')"
-        process = Process(first, python_command(code))
-        try:
-            process.answer(lambda: False)
-            for number in range(count):
-                process.ask({"seed": seed(config.run.seed, number, 0, series), "spp": kind.spp, "out": str(out)})
-                answer = process.answer(lambda: False)
-                kind.arrays_mib = max(kind.arrays_mib or 0.0, float(answer["peak_mib"]))
-                taken.append(np.load(out))
-            kind.samples = np.stack(taken)
-        except Ended as end:
-            kind.end = end
-        finally:
-            process.close()
-
-
-# --- what is said of the samples --------------------------------------------------------------------------------------
+    first = {"config": dump(comparable(config, kind.by)), "source": str(config.source), "variant": VARIANT,
+             "memory_limit": limit, "allow_code": False, "quantity": "fixed", "purpose": series,
+             "arrays": pictures.arrays}  # fmt: skip
+    process, taken = start_process(first, "reslrb_cli.measure.steps:begin"), []
+    try:
+        process.answer(lambda: False)
+        for number in range(count):
+            process.ask({"numbers": [number], "spp": kind.spp, "image": 0, "cold": True, "release": False})
+            answer = process.answer(lambda: False)
+            kind.arrays_mib = max(kind.arrays_mib or 0.0, float(answer["peak_mib"]))
+            taken.append(answer["values"][0, : np.prod(pictures.shape)].reshape(pictures.shape))
+        kind.samples = np.stack(taken)
+    except Ended as end:
+        kind.end = end
+    finally:
+        process.close()
 
 
 def compare(pairs: Sequence[tuple[Kind, Kind]]) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from make_figures import write_panels
 
 from paper import figure1, figure5
 from paper.figures import main
-from paper.gradients import OWN, Kind, comparable, fall, relative_noise, sample
+from paper.gradients import OWN, Kind, comparable, fall, relative_noise, sample, take_pictures
 from paper.page import FIGURES
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
@@ -106,7 +106,7 @@ def test_relative_noise_of_known_noise() -> None:
 
 def test_written_files(tmp_path: Path) -> None:
     kinds, image = pretended(), np.random.default_rng(2).uniform(size=(16, 16, 3)).astype(np.float32)
-    panels = figure1.panels({"target": image, "initial": image}, kinds, figure1.Plan.limit)
+    panels = figure1.panels(image, image, kinds, figure1.Plan.limit)
     assert [title for title, _ in panels[0]][2] == "naive AD, 1024 spp: over 2 GiB"
     write_panels(panels, tmp_path / "figure1.png")
     assert (tmp_path / "figure1.png").read_bytes().startswith(b"\x89PNG")
@@ -122,9 +122,10 @@ def test_compared_methods_have_one_expectation(config: Config) -> None:
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)
     options = comparable(config, OWN).integrator.options()
     assert (options["filter_normalization"], options["attached_sampling"]) == ("detached", "follow")
-    kinds = [Kind(by, 64, by) for by in (OWN, "ptracer")]
+    kinds, pictures = [Kind(by, 64, by) for by in (OWN, "ptracer")], take_pictures(config, 16)
+    pictures.arrays["adjoints"] = adjoint[None]
     for kind in kinds:
-        sample(kind, 16, config, adjoint, kind.by)
+        sample(kind, 16, config, pictures, kind.by)
         assert kind.samples is not None
         assert kind.samples.shape == (16, 8, 8, 1)
     ours, naive = (kind.rows for kind in kinds)
@@ -139,7 +140,8 @@ def test_a_process_ends_at_its_limit() -> None:
     count.
     """
     kind = Kind("naive AD", 2**16, "ptracer")
-    sample(kind, 1, load(figure1.CONFIG, SMALL), np.ones((16, 16, 3), np.float32), "test", 3 << 29)
+    config = load(figure1.CONFIG, SMALL)
+    sample(kind, 1, config, take_pictures(config, 16), "test", 3 << 29)
     assert kind.end is not None
     assert kind.end.status is BenchStatus.OUT_OF_MEMORY
     assert kind.samples is None
