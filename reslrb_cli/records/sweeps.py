@@ -131,7 +131,7 @@ def short_keys(keys: Sequence[str]) -> dict[str, str]:
     found = {}
     for key in keys:
         parts = key.split(".")
-        ends = [".".join(parts[-length:]) for length in range(1, len(parts) + 1)]
+        ends = [".".join(parts[-length:]) for length in range(1, len(parts))]
         others = [f".{other}" for other in keys if other != key]
         found[key] = next((end for end in ends if not any(other.endswith(f".{end}") for other in others)), key)
     return found

@@ -15,6 +15,7 @@ from cli import tiny
 from cli.tiny import SCENE, write_experiment
 
 from reslrb_cli.cli import _Main, main
+from reslrb_cli.cli.options import exit_code
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import (
@@ -28,6 +29,7 @@ from reslrb_cli.errors import (
 )
 from reslrb_cli.optimization import memory as room
 from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.scene import load as scene_load
 
 # Every error that a user can cause ends in one line and its exit code. `--help` works without delay.
@@ -131,6 +133,20 @@ def test_usage_errors_are_one_line(args: list[str], line: str) -> None:
     code, _, err = tiny.outcome(*args)
     assert (code, len(err.strip().splitlines())) == (ExitCode.USAGE, 1)
     assert err.startswith(line)
+
+
+@pytest.mark.parametrize(
+    ("interrupted", "done", "states", "code"),
+    [
+        (True, True, {BenchStatus.OK}, ExitCode.INTERRUPTED),
+        (False, True, {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}, ExitCode.DONE),
+        (False, False, {BenchStatus.OUT_OF_MEMORY}, ExitCode.OUT_OF_MEMORY),
+        (False, False, {BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY}, ExitCode.CHECK_FAILED),
+        (False, False, set(), ExitCode.CHECK_FAILED),
+    ],
+)
+def test_the_exit_code_of_a_comparison(interrupted: bool, done: bool, states: set[BenchStatus], code: ExitCode) -> None:
+    assert exit_code(interrupted, done, states) is code
 
 
 @pytest.mark.parametrize("command", COMMANDS)

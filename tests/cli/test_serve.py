@@ -196,6 +196,14 @@ def test_the_folder_may_be_one_run_or_sweep(runs, name):
     assert len(serve.find_served(runs / name)) == (1 if name != "s" else 2)
 
 
+def test_the_newest_run_is_first(served, runs):
+    for hour, name in enumerate(("b", "s/rate=1-seed=0", "a <b>")):
+        change_manifest(runs / name, started=f"2026-01-02T0{hour}:00:00+00:00")
+    _, text = ask(served)
+    shown = re.findall(r"/\?with=([^\"]+)", text)
+    assert shown == ["a+%3Cb%3E", "s%2Frate%3D1-seed%3D0", "b"]
+
+
 def test_names_need_not_be_utf_8(served, runs):
     os.rename(runs / "a <b>", os.fsencode(runs) + b"/\xff")
     _, text = ask(served)

@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from reslrb_cli.records import images
 from reslrb_cli.records.images import (
     FORMATS,
     finite_range,
@@ -156,3 +157,7 @@ def test_damaged_files_are_reported(tmp_path):
             read_layers(tmp_path / "b.exr")
     with pytest.raises(OSError, match="gone"):
         read_layers(tmp_path / "gone.exr")
+
+
+def test_channels_of_a_layer_have_an_order():
+    assert sorted(["Z", "A", "2", "B", "10", "R", "G", "1"], key=images._place) == [*"RGBA", "Z", "1", "2", "10"]

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -350,3 +351,11 @@ def test_location(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cache_folder() == Path("/xdg/reslrb")
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert cache_folder() == Path.home() / ".cache" / "reslrb"
+
+
+def test_a_decision_may_tell_the_time_of_its_measurement() -> None:
+    made = Decision(setting="paths", value="light", why="it is faster", seconds=1.25)
+    plain = "paths light: it is faster"
+    assert [made.line(), replace(made, seconds=0.0).line(cost=True)] == [plain, plain]
+    assert made.line(cost=True) == f"{plain} (measured in 1.2 s)"
+    assert replace(made, cached=True).line(cost=True) == f"{plain} (as an earlier run measured)"

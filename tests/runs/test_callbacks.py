@@ -575,6 +575,18 @@ def test_images_of_several_views_are_named_by_their_sensors() -> None:
         assert set(listener.images) == names
 
 
+def test_the_first_error_at_the_end_is_raised() -> None:
+    """All callbacks are told of the end."""
+
+    class Other(Listener):
+        """Another class, which the message names."""
+
+    both = Listener("end"), Other("end")
+    with pytest.raises(rl.ConfigError, match="Listener"):
+        calls_of("a", 0, *both).end("finished")
+    assert [each.calls for each in both] == [[("end", "finished")]] * 2
+
+
 def test_an_end_without_a_beginning_logs_nothing(server: Any) -> None:
     for each in (server.make(), loggers.TensorBoard("here")):
         calls_of("a", 0, each).end("failed")

@@ -27,7 +27,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.run_folder import read_config, read_value
-from reslrb_cli.runs import resume
+from reslrb_cli.runs import prepare, resume
 from reslrb_cli.runs.prepare import moves
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
@@ -120,6 +120,18 @@ def test_the_previous_state_is_used_and_reported(run: Path, capsys: pytest.Captu
     assert int(state_of(run)["iteration"]) == 6
     with np.load(run / PREVIOUS) as previous:  # not the damaged state
         assert int(previous["iteration"]) == 5
+
+
+def test_a_missing_state_is_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / STATE).unlink()
+    assert optimize("--resume", str(run), "--quiet") == 0
+    err = capsys.readouterr().err
+    assert "state.npz: is missing; continuing from the previous state, after 3 iterations" in err
+
+
+def test_long_settings_are_cut_off_in_messages() -> None:
+    for value, shown in ((None, "not set"), ("x" * 60, "x" * 60), ("x" * 61, "x" * 57 + "...")):
+        assert prepare._shown(value) == shown
 
 
 def test_a_damaged_state_does_not_become_the_previous_one(run: Path) -> None:
