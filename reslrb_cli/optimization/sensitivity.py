@@ -158,8 +158,8 @@ def _steepest(problem: Problem, key: str, v: Any, gradient: Array) -> float:
             problem.stop_if_interrupted()
             problem.apply({key: variable.to_scene(end)})
             images.append(see_images(problem, spp))
-        halves = (0.5 * finite(a - b) for a, b in zip(*images, strict=True))
-        change = math.sqrt(sum(float(np.square(half).sum()) for half in halves)) / (size or 1.0)
+        changes = (0.5 * finite(a - b) for a, b in zip(*images, strict=True))
+        change = math.sqrt(sum(float(np.square(each).sum()) for each in changes)) / (size or 1.0)
         if change == 0 and spp < problem.config.run.spp:  # few samples may miss the effect
             spp = problem.config.run.spp
             continue
