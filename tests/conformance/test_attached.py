@@ -129,7 +129,7 @@ QUICK = ("slab", "bounce")
 
 def distance(name: str, sampling: str) -> float:
     """Return the largest deviation of the first three derivatives, relative to the largest entry of the gradient."""
-    case, options = SCENES[name].case(), dict(SCENES[name].options)
+    case, options = SCENES[name].setup(), dict(SCENES[name].options)
     options |= {"attached_sampling": sampling}
     tracer = integrator("reslrb", **options, estimator="stack")
     gradient = case.gradient(tracer, 100, 16)
@@ -201,7 +201,7 @@ def test_as_a_plugin(normalization: str):
 
 
 def test_a_moving_lamp_is_refused():
-    case = SCENES["moved_point"].case()
+    case = SCENES["moved_point"].setup()
     with pytest.raises(UnsupportedScene, match="forward mode has no derivatives of moving emitters"):
         case.tangent(integrator("reslrb", 2, estimator="stack"), np.array([1.0, 0, 0]), 1, 4)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from conformance.attached_cases import CASES
 from conformance.moving_lamps import CASES as LAMPS
-from measure.differenced import AttachedScene, compare_with_differences
+from measure.differenced import attached, compare_with_differences
 from measure.faults import Fault, plant, planted
 from measure.moving_light import SCENES, moved, point, room, shelf, wall
 
@@ -21,6 +21,7 @@ from reslrb_cli.integrators.plans import stays
 from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
+from reslrb_cli.measure.scenes.case import SceneCase
 from reslrb_cli.measure.scenes.moving import Move, Pose
 from reslrb_cli.measure.scenes.small import diffuse
 
@@ -36,9 +37,9 @@ SPECULAR = 1e-4
 #: Cases of test_attached.py in which every path has one connection, which lies behind specular vertices only.
 SINGLE = ("slab", "latents", "passes", "thin_lens", "second_sensor", "crop", "lanczos", "mirror")
 BY_NAME = {case.name: case for case in CASES}
-ONE = AttachedScene("one", "one diffuse vertex in the chain", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved,
+ONE = attached("one", "one diffuse vertex in the chain", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved,
                     spp=64, options={"max_depth": 5})  # fmt: skip
-TWO = AttachedScene("two", "two diffuse vertices in the chain", shelf, moved, spp=64, options={"max_depth": 6})
+TWO = attached("two", "two diffuse vertices in the chain", shelf, moved, spp=64, options={"max_depth": 6})
 BOTH = replace(TWO, name="both", moves=lambda _: [Pose("floor.to_world", ("ty",)), Pose("wall.to_world", ("tx",))])
 
 
@@ -78,14 +79,14 @@ def exact_gradients(name: str, sampling: str, count: int) -> np.ndarray:
     """
     [scene] = [scene for scene in (ONE, TWO, BOTH) if scene.name == name]
     tracer = integrator("reslrb", **scene.options, attached_sampling=sampling, estimator="stack")
-    return scene.case().gradients(tracer, seeds(count), scene.spp)
+    return scene.setup().gradients(tracer, seeds(count), scene.spp)
 
 
-def bias(scene: AttachedScene, sampling: str, count: int, **options: Any) -> Bias:
+def bias(scene: SceneCase, sampling: str, count: int, **options: Any) -> Bias:
     """Return the bias of `reservoir` relative to `stack` at equal seeds."""
     exact = exact_gradients(scene.name, sampling, count)
     tracer = integrator("reslrb", **scene.options, attached_sampling=sampling, estimator="reservoir", **options)
-    ours = scene.case().gradients(tracer, seeds(count), scene.spp)
+    ours = scene.setup().gradients(tracer, seeds(count), scene.spp)
     mean = exact.mean(0)
     along = (ours - exact) @ mean / (mean @ mean)
     noise = (ours - exact).var(0, ddof=1).sum() / exact.var(0, ddof=1).sum()
@@ -94,7 +95,7 @@ def bias(scene: AttachedScene, sampling: str, count: int, **options: Any) -> Bia
 
 @pytest.mark.long
 @pytest.mark.parametrize("scene", [pytest.param(ONE, marks=pytest.mark.long), TWO], ids=lambda scene: scene.name)
-def test_no_bias_behind_diffuse_vertices(scene: AttachedScene):
+def test_no_bias_behind_diffuse_vertices(scene: SceneCase):
     found = bias(scene, "stay", 12)
     print(scene.name, found)
     assert abs(found.value) < 4 * found.error
@@ -105,7 +106,7 @@ def test_no_bias_behind_diffuse_vertices(scene: AttachedScene):
 @pytest.mark.parametrize("sampling", ["follow", "stay"])
 @pytest.mark.parametrize("damping", [0.003, 0.01, 0.03, 0.1, 0.3, 1.0])
 @pytest.mark.parametrize("scene", [ONE, TWO], ids=lambda scene: scene.name)
-def test_no_bias_whatever_the_damping(scene: AttachedScene, damping: float, sampling: str):
+def test_no_bias_whatever_the_damping(scene: SceneCase, damping: float, sampling: str):
     found = bias(scene, sampling, 64, jacobian_damping=damping)
     print(scene.name, sampling, damping, found)
     assert abs(found.value) < 4 * found.error
@@ -181,7 +182,7 @@ def test_two_kernels_equal_one(name: str):
     Both ways give the same gradient.
     """
     scene = replace(ONE, spp=16)
-    case = scene.case()
+    case = scene.setup()
     tracer = integrator("reslrb", **scene.options, estimator="reservoir", jacobian_damping=0.01)
     apart = case.gradient(tracer, 1, scene.spp, step=gradient_step)
     tracer.correlated, whole = None, case.gradients(tracer, [1], scene.spp)[0]
@@ -249,7 +250,7 @@ def pushed(scene: Any) -> list[Move]:
     return [Pose("wall.to_world", ("tx", "ry", "rz"), (1, 1, 0))]
 
 
-def rough(name: str) -> AttachedScene:
+def rough(name: str) -> SceneCase:
     return replace(SCENES[name], spp=64, options=dict(SCENES[name].options))
 
 
@@ -257,8 +258,8 @@ AGREEING = {
     "bounce": replace(SCENES["bounce"], spp=64),
     "rough_mirror": rough("rough_mirror"),
     "rough_surface": rough("rough_surface"),
-    "moved_floor": AttachedScene("", "", lit_wall, tilted, options={"max_depth": 3}),
-    "moved_wall": AttachedScene("", "", lit_wall, pushed, options={"max_depth": 3}),
+    "moved_floor": attached("", "", lit_wall, tilted, options={"max_depth": 3}),
+    "moved_wall": attached("", "", lit_wall, pushed, options={"max_depth": 3}),
 }  # fmt: skip
 QUICK_SAMPLING = ("bounce", "moved_floor", "moved_wall")
 #: The scenes that the default suite runs, because they need few seeds: light reflects off a moving object, and is
@@ -266,10 +267,10 @@ QUICK_SAMPLING = ("bounce", "moved_floor", "moved_wall")
 FEWEST = ("bounce",)
 
 
-def gradients(scene: AttachedScene, sampling: str, count: int, first: int = 1) -> np.ndarray:
+def gradients(scene: SceneCase, sampling: str, count: int, first: int = 1) -> np.ndarray:
     """Return gradients (N, K) at `count` seeds, starting with seed number `first`."""
     tracer = integrator("reslrb", **dict(scene.options) | {"attached_sampling": sampling}, estimator="stack")
-    return scene.case().gradients(tracer, seeds(count, first), scene.spp)
+    return scene.setup().gradients(tracer, seeds(count, first), scene.spp)
 
 
 @pytest.mark.long
@@ -311,7 +312,7 @@ def test_finite_differences_agree_if_auto_stays(name: str):
     ids=str,
 )
 def test_the_choice_of_auto(bsdf: dict[str, Any], sampling: str, max_depth: int, expected: tuple[bool, bool]):
-    case = AttachedScene("", "", lambda: lit_wall(bsdf), tilted).case()
+    case = attached("", "", lambda: lit_wall(bsdf), tilted).setup()
     tracer = integrator("reslrb", max_depth, estimator="stack", attached_sampling=sampling)
     leaves = case.leaves()
     assert any(dr.grad_enabled(leaf) for leaf in leaves.values())

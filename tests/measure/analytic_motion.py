@@ -15,12 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from measure.differenced import SIZE, AttachedScene
+from measure.differenced import SIZE, attached
 from measure.moving_light import point, setting
 from numpy.typing import NDArray
 
 from reslrb_cli.measure.gradients import smooth_weights
 from reslrb_cli.measure.scenes.analytic import fresnel
+from reslrb_cli.measure.scenes.case import SceneCase
 from reslrb_cli.measure.scenes.moving import FILTER, Pose
 from reslrb_cli.measure.scenes.small import glass, lit_square, rectangle, rgb, transform
 
@@ -40,7 +41,7 @@ class KnownMotion:
     `tolerance` is the error of the formula, relative to the largest derivative.
     """
 
-    scene: AttachedScene
+    scene: SceneCase
     weights: Array
     derivatives: Array
     tolerance: float
@@ -79,7 +80,7 @@ def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, hal
     slope = (objective(tilt + h) - objective(tilt - h)) / (2 * h)
     place = transform(translate=[0, height, 0]) @ transform(rotate=([0, 0, 1], float(np.rad2deg(tilt))))
     surface = rectangle(glass(ior), place @ transform(rotate=([1, 0, 0], -90), scale=2))
-    scene = AttachedScene(
+    scene = attached(
         "tilted_surface", "parallel light on a tilted surface of glass",
         lambda: setting(lamp=parallel(half, 0, 3, 50.0), top=surface),
         lambda scene: [Pose("top.to_world", ("rz",), (0, height, 0))], options={"max_depth": 3},
@@ -101,7 +102,7 @@ def ball_lens(radius: float = 2.4, ior: float = 1.5, offset: float = 0.04, half:
     passed = (1 - ((ior - 1) / (ior + 1)) ** 2) ** 2
     flux = 5e4 * (2 * half) ** 2
     slopes = np.array([1.0, -offset / f, offset])
-    scene = AttachedScene(
+    scene = attached(
         "ball_lens", "a thin beam through a ball of glass with its focus on the receiver",
         lambda: setting(lamp=parallel(half, offset, f + radius + 1, 5e4),
                         lens={"type": "sphere", "center": [0, f, 0], "radius": radius,
@@ -128,7 +129,7 @@ def lamp_over_plane(position: tuple[float, float, float] = (0.1, 0.7, 0.2), node
     slopes = np.stack([-3 * h * dx / d**5, 1 / d**3 - 3 * h**2 / d**5, -3 * h * dz / d**5])
     area = np.outer(np.tile(weight, SIZE), np.tile(weight, SIZE)) / 4
     known = np.einsum("kij,ij,ijc,c->k", slopes, area, g, RHO / np.pi * intensity)
-    scene = AttachedScene(
+    scene = attached(
         "lamp_over_plane", "a point light over a plane", lambda: setting(lamp=point(position)),
         lambda scene: [Pose("lamp.position", ("tx", "ty", "tz"))], options={"max_depth": 2},
     )  # fmt: skip

@@ -1,17 +1,17 @@
-"""Scenes whose parameters move light (`AttachedScene`), and their comparison with finite differences
-(`Differenced`).
-"""
+"""Scenes whose parameters move light (`attached`), and their comparison with finite differences (`Differenced`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure.gradients import Case, integrator, seeds
-from reslrb_cli.measure.scenes.moving import AMPLITUDES, Move, moving_case
+from reslrb_cli.measure.gradients import integrator, seeds
+from reslrb_cli.measure.scenes.case import Differences, Moves, SceneCase
+from reslrb_cli.measure.scenes.catalogue import moved
+from reslrb_cli.measure.scenes.moving import AMPLITUDES
 
 #: Width and height of a film in pixels.
 SIZE = 32
@@ -20,29 +20,15 @@ SIZE = 32
 ONE_IN, EXTRAPOLATED = 4, 3
 
 
-@dataclass(frozen=True)
-class AttachedScene:
-    """One scene. `scene` and `moves` are functions, because they need Mitsuba. The first amplitude is the most
-    informative.
+def attached(name: str, about: str, scene: Callable[[], dict], moves: Moves, step: float = 0.01, **more: Any
+             ) -> SceneCase:  # fmt: skip
+    """Return a case whose parameters move light. The first amplitude of `moves` is the most informative.
 
     Finite differences hold. Moved paths meet no silhouettes, shadow edges or edges at rest, and dL/dI is smooth and
-    vanishes at the film's border. `step` is the step of the amplitudes, and `options` are the integrators' options. To
-    reduce noise, increase `seeds` and not `spp`. From 1000 samples per pixel on, single-precision rounding in image
-    sums affects their differences.
+    vanishes at the film's border. To reduce noise, increase `seeds` and not `spp`. From 1000 samples per pixel on,
+    single-precision rounding in image sums affects their differences.
     """
-
-    name: str
-    about: str
-    scene: Callable[[], dict]
-    moves: Callable[[Any], Sequence[Move]]
-    step: float = 0.01
-    spp: int = 64
-    seeds: int = 8
-    options: Mapping[str, Any] = field(default_factory=lambda: {"max_depth": 4})
-
-    def case(self) -> Case:
-        """Return the loaded scene with its amplitudes as the only parameter."""
-        return moving_case(self.scene(), self.moves)
+    return moved(name, about, scene, step, moves, depth=4, **more)
 
 
 @dataclass(frozen=True)
@@ -103,16 +89,17 @@ class Differenced:
         )
 
 
-def compare_with_differences(scene: AttachedScene, estimator: str = "stack", count: int | None = None) -> Differenced:
+def compare_with_differences(scene: SceneCase, estimator: str = "stack", count: int | None = None) -> Differenced:
     """Differentiate a scene with an estimator, and with finite differences of its image at the same random numbers.
     Return both.
     """
-    case = scene.case()
+    assert isinstance(scene.source, Differences)
+    case, step = scene.setup(), scene.source.step
     tracer = integrator("reslrb", **scene.options, estimator=estimator)
     chosen = seeds(count or scene.seeds)
     ours = case.gradients(tracer, chosen, scene.spp)
     directions = np.eye(len(case.initial[AMPLITUDES]))
-    near = case.differences(tracer, directions, chosen, scene.spp, scene.step)
+    near = case.differences(tracer, directions, chosen, scene.spp, step)
     few = chosen[: max(len(chosen) // ONE_IN, EXTRAPOLATED)]
-    far = case.differences(tracer, directions, few, scene.spp, 2 * scene.step)
+    far = case.differences(tracer, directions, few, scene.spp, 2 * step)
     return Differenced(ours, near, (near[: len(few)] - far) / 3)

@@ -13,9 +13,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from measure.differenced import SIZE, AttachedScene
+from measure.differenced import SIZE, attached
 from numpy.typing import NDArray
 
+from reslrb_cli.measure.scenes.case import SceneCase
 from reslrb_cli.measure.scenes.moving import (
     FILTER,
     Displacement,
@@ -103,14 +104,14 @@ def sphere_lens(radius: float = 0.8, y: float = 1.95, cutoff: float = 18, bsdf: 
 
 
 GLASS_SCENES = [
-    AttachedScene("slab", "a glass slab with waves under a spot light", slab, waving, spp=256),
-    AttachedScene("slab_beam", "the same under parallel light with a hard edge", lambda: slab(lamp=beam()), waving,
+    attached("slab", "a glass slab with waves under a spot light", slab, waving, spp=256),
+    attached("slab_beam", "the same under parallel light with a hard edge", lambda: slab(lamp=beam()), waving,
                   step=0.005),
-    AttachedScene("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
+    attached("sphere_lens", "a ball of glass, moved and scaled", sphere_lens,
                   lambda scene: moving_sphere("lens", (0, 1.95, 0)), spp=512),
-    AttachedScene("rough_surface", "rough glass with waves, the receiver inside", rough_surface, waving,
+    attached("rough_surface", "rough glass with waves, the receiver inside", rough_surface, waving,
                   spp=512, seeds=32, options={"max_depth": 3}),
-    AttachedScene("rough_surface_alpha", "the roughness of rough glass", rough_surface,
+    attached("rough_surface_alpha", "the roughness of rough glass", rough_surface,
                   lambda scene: [Number("top.bsdf.alpha.value")], step=0.03, spp=512, seeds=32,
                   options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
@@ -129,8 +130,8 @@ def ceiling(bsdf: dict = MIRROR) -> dict:
 
 
 MIRRORS_SCENES = [
-    AttachedScene("mirror", "a mirror with waves", ceiling, lambda scene: waving(scene, "mirror", 1.9), step=0.002),
-    AttachedScene("rough_mirror", "a rough metal with waves", lambda: ceiling(BRUSHED),
+    attached("mirror", "a mirror with waves", ceiling, lambda scene: waving(scene, "mirror", 1.9), step=0.002),
+    attached("rough_mirror", "a rough metal with waves", lambda: ceiling(BRUSHED),
                   lambda scene: waving(scene, "mirror", 1.9), step=0.003, options={"max_depth": 3}),
 ]  # fmt: skip
 
@@ -155,11 +156,11 @@ def rolling(scene: Any, name: str = "floor", y: float = 0) -> list[Move]:
 
 
 PLACES_SCENES = [
-    AttachedScene("moved_point", "a point light over a plane", lambda: setting(lamp=point()),
+    attached("moved_point", "a point light over a plane", lambda: setting(lamp=point()),
                   lambda scene: [Pose("lamp.position", ("ty", "tx", "tz"))], options={"max_depth": 2}),
-    AttachedScene("moved_receiver", "a plane under a point light, moved and tilted", lambda: setting(lamp=point()),
+    attached("moved_receiver", "a plane under a point light, moved and tilted", lambda: setting(lamp=point()),
                   lambda scene: [Pose("floor.to_world", ("ty", "rx", "rz"))], options={"max_depth": 2}),
-    AttachedScene("bent_receiver", "a plane under a point light that is bent", hills, rolling,
+    attached("bent_receiver", "a plane under a point light that is bent", hills, rolling,
                   options={"max_depth": 2}, spp=256),
 ]  # fmt: skip
 
@@ -211,14 +212,14 @@ def moved(scene: Any) -> list[Move]:
 OPTIONS = {"max_depth": 5}
 
 ROOMS_SCENES = [
-    AttachedScene("bounce", "a slab that lights a wall by way of the floor",
+    attached("bounce", "a slab that lights a wall by way of the floor",
                   lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved, spp=512, seeds=32, options=OPTIONS),
-    AttachedScene("bounce_steps", "the same onto a texture with steps", lambda: room(wall=wall(steps())), moved,
+    attached("bounce_steps", "the same onto a texture with steps", lambda: room(wall=wall(steps())), moved,
                   spp=512, seeds=32, options=OPTIONS),
-    AttachedScene("bounce_corner", "the same into a corner of two walls", corner, moved,
+    attached("bounce_corner", "the same into a corner of two walls", corner, moved,
                   spp=512, seeds=32, options=OPTIONS),
 ]  # fmt: skip
 
-SCENES: dict[str, AttachedScene] = {
+SCENES: dict[str, SceneCase] = {
     scene.name: scene for scene in (*GLASS_SCENES, *MIRRORS_SCENES, *PLACES_SCENES, *ROOMS_SCENES)
 }

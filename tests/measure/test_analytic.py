@@ -179,7 +179,7 @@ MOTIONS: dict[str, Callable[[], KnownMotion]] = {
 
 
 def gradients(motion: KnownMotion, count: int = 8, spp: int = 128) -> np.ndarray:
-    case = motion.scene.case()
+    case = motion.scene.setup()
     case.weigh(motion.weights)
     return case.gradients(integrator("reslrb", **motion.scene.options, estimator="stack"), seeds(count), spp)
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from cli.tiny import ended
 from measure.analytic_motion import centre_of_gravity, parallel
-from measure.differenced import AttachedScene, Differenced, compare_with_differences
+from measure.differenced import Differenced, attached, compare_with_differences
 from measure.faults import checked, room
 from measure.moving_light import ROOMS_SCENES as ROOMS
 from measure.moving_light import SCENES, setting
@@ -26,6 +26,7 @@ from reslrb_cli.measure import missing as missing_check
 from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing, _ratio, _sums
 from reslrb_cli.measure.scenes.analytic import fresnel
+from reslrb_cli.measure.scenes.case import SceneCase
 from reslrb_cli.measure.scenes.moving import Displacement, Move, Pose, smooth_fields, vertices
 from reslrb_cli.measure.scenes.small import transform
 from reslrb_cli.optimization import targets
@@ -41,11 +42,11 @@ HALF, EDGE, HEIGHT, TILT, IOR, SLAB = 0.6, 0.2, 1.4, 0.5, 1.5, 0.3
 SPP, SEEDS, REACH = 64, 24, 0.02
 
 
-def share(scene: AttachedScene, count: int = SEEDS) -> tuple[float, float]:
+def share(scene: SceneCase, count: int = SEEDS) -> tuple[float, float]:
     """Return the missing share and its error for the centre of gravity of the landing light, along the scene's only
     amplitude.
     """
-    case, options = scene.case(), scene.options
+    case, options = scene.setup(), scene.options
     tracer = integrator("reslrb", **options, estimator="stack")
     tracing = Tracing([case], integrator("walk_ad", **options), tracer, SPP)
     found = Missing([LineSegment(np.ones(1), -REACH, REACH, [centre_of_gravity()])])
@@ -57,27 +58,27 @@ def share(scene: AttachedScene, count: int = SEEDS) -> tuple[float, float]:
     return record.share, record.standard_error
 
 
-def half_covered(moved: str) -> AttachedScene:
+def half_covered(moved: str) -> SceneCase:
     """Return a scene with a black sheet over a part of a parallel beam. The beam covers -HALF to HALF in x, and the
     sheet covers -HALF to EDGE. Either can move.
     """
     cover = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.0},
              "to_world": transform(translate=[EDGE - 1, HEIGHT, 0], rotate=([1, 0, 0], -90), scale=1)}  # fmt: skip
-    return AttachedScene(
+    return attached(
         f"half_covered, {moved}", "a black sheet in a parallel beam",
         lambda: setting(lamp=parallel(HALF, 0, 3, 10.0), cover=cover),
         lambda scene: [Pose(f"{moved}.to_world", ("tx",), (0, 0, 0))], options={"max_depth": 2},
     )  # fmt: skip
 
 
-def slab_in_a_beam() -> AttachedScene:
+def slab_in_a_beam() -> SceneCase:
     """Return a scene with a tilted glass surface narrower than the beam, above a receiver in the glass. Light passes by
     the surface's edges.
     """
     glass = {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
     place = transform(translate=[0, HEIGHT, 0]) @ transform(rotate=([0, 0, 1], float(np.rad2deg(TILT))))
     size = transform(rotate=([1, 0, 0], -90), scale=[SLAB, 2, 1])
-    return AttachedScene(
+    return attached(
         "slab_in_a_beam", "a beam on a narrower surface of glass",
         lambda: setting(lamp=parallel(HALF, 0, 3, 10.0),
                         top={"type": "rectangle", "bsdf": glass, "to_world": place @ size}),
@@ -126,7 +127,7 @@ def test_a_texture_has_a_complete_derivative():
     ],
     ids=["lamp", "cover", "slab"],
 )
-def test_known_shares(scene: Callable[[], AttachedScene], known: float, count: int):
+def test_known_shares(scene: Callable[[], SceneCase], known: float, count: int):
     found, error = share(scene(), count)
     assert error < 0.03 * known, "too noisy to see a fault"
     assert abs(found - known) < 4 * error + 1e-9

@@ -570,35 +570,36 @@ def grazing(degrees: float) -> dict:
     return pool(light=beam(start, (at, 1.2), 0.02), slope=0.1, height=1.2)
 
 
-def _moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, moves: Moves | None = None,
-           depth: int = 3, left: float = 1e-3, **more: Any) -> SceneCase:  # fmt: skip
+def moved(name: str, about: str, scene: Callable[[], dict], step: float = 0.01, moves: Moves | None = None,
+          depth: int = 3, left: float = 1e-3, **more: Any) -> SceneCase:  # fmt: skip
+    """Return a case of motion, whose differences have this `step` in the amplitudes."""
     fields: dict[str, Any] = {"image": "ptracer", "seeds": 8, "signed": True, "options": {"max_depth": depth}} | more
     return SceneCase(name, about, scene, (), Differences(step, left=left), moves=moves or bending(), **fields)
 
 
 ROUGH: dict[str, Any] = {"type": "roughdielectric", "alpha": 0.1}
 MOTION = [
-    _moved("slope_0", "a flat glass surface that begins to bend", lambda: pool(slope=0)),
-    _moved("slope_1e-6", "a glass surface with slopes of one millionth", lambda: pool(slope=1e-5)),
-    _moved("slope_0.3", "a glass surface with slopes of a third", lambda: pool(slope=3), 0.005),
-    _moved("sliding_faces", "a surface whose faces slide through the light", pool, moves=bending(axes=(1, 0, 1))),
-    _moved("total_reflection", "a surface with waves, beyond the critical angle",  # light from inside
-           lambda: pool(light=beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256), 0.0015),
-    _moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, bending(0.1), seeds=12),
-    _moved("parallel_faces", "a slab with flat faces that begins to bend", lambda: pool(slope=0, thickness=0.2),
-           depth=4),
-    _moved("thin_slab", "a slab whose thickness is ten ray offsets", lambda: pool(slope=0, thickness=THIN), 0.1,
-           bending(THIN), 4, spp=256),
-    _moved("moved_index_1", "moving glass of index 1, and the lamp above the glass", lambda: pool(glass(1.0)),
-           moves=bending(lamp=True)),
-    _moved("moved_index_3", "moving glass of index 3", lambda: pool(glass(3.0))),
-    _moved("moved_rough_1.001", "moving rough glass of index 1.001, and the lamp above the glass",
-           lambda: pool(glass(1.001) | ROUGH), moves=bending(lamp=True), equal=1e-3),
-    _moved("moved_rough_3", "moving rough glass of index 3", lambda: pool(glass(3.0) | ROUGH), equal=1e-3),
-    _moved("millimetres", "a slab at a thousand times its size", lambda: pool(thickness=0.2, scale=1e3),
-           moves=bending(scale=1e3), depth=4),
-    _moved("shrunk_to_0.03", "a slab at three hundredths of its size", lambda: pool(thickness=0.2, scale=0.03),
-           moves=bending(scale=0.03), depth=4, left=5e-3),
+    moved("slope_0", "a flat glass surface that begins to bend", lambda: pool(slope=0)),
+    moved("slope_1e-6", "a glass surface with slopes of one millionth", lambda: pool(slope=1e-5)),
+    moved("slope_0.3", "a glass surface with slopes of a third", lambda: pool(slope=3), 0.005),
+    moved("sliding_faces", "a surface whose faces slide through the light", pool, moves=bending(axes=(1, 0, 1))),
+    moved("total_reflection", "a surface with waves, beyond the critical angle",  # light from inside
+          lambda: pool(light=beam((-1.87, 1.0), (-1.6, 1.2), 0.12), slope=0.1, height=1.2, cells=256), 0.0015),
+    moved("grazing_85", "light at 85 degrees on glass", lambda: grazing(85), 0.005, bending(0.1), seeds=12),
+    moved("parallel_faces", "a slab with flat faces that begins to bend", lambda: pool(slope=0, thickness=0.2),
+          depth=4),
+    moved("thin_slab", "a slab whose thickness is ten ray offsets", lambda: pool(slope=0, thickness=THIN), 0.1,
+          bending(THIN), 4, spp=256),
+    moved("moved_index_1", "moving glass of index 1, and the lamp above the glass", lambda: pool(glass(1.0)),
+          moves=bending(lamp=True)),
+    moved("moved_index_3", "moving glass of index 3", lambda: pool(glass(3.0))),
+    moved("moved_rough_1.001", "moving rough glass of index 1.001, and the lamp above the glass",
+          lambda: pool(glass(1.001) | ROUGH), moves=bending(lamp=True), equal=1e-3),
+    moved("moved_rough_3", "moving rough glass of index 3", lambda: pool(glass(3.0) | ROUGH), equal=1e-3),
+    moved("millimetres", "a slab at a thousand times its size", lambda: pool(thickness=0.2, scale=1e3),
+          moves=bending(scale=1e3), depth=4),
+    moved("shrunk_to_0.03", "a slab at three hundredths of its size", lambda: pool(thickness=0.2, scale=0.03),
+          moves=bending(scale=0.03), depth=4, left=5e-3),
 ]  # fmt: skip
 
 # ---- Lamps that no sample finds, or one sample in a thousand ----
