@@ -64,7 +64,7 @@ def test_resolution_resamples(make_scene):
     finer = select(scene, {"key": TEXTURE, "resolution": [12, 8]}).array(TEXTURE)
     assert finer.shape == (8, 12, 3)
     assert np.all(np.diff(finer[0, :, 0]) >= 0)
-    assert select(scene, {"key": TEXTURE, "resolution": [4, 6]}).array(TEXTURE).shape == (6, 4, 3)
+    assert select(make_scene(), {"key": TEXTURE, "resolution": [4, 6]}).array(TEXTURE).shape == (6, 4, 3)
     assert finer.mean() == pytest.approx(0.5, abs=1e-3)
 
 
