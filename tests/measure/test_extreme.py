@@ -17,7 +17,9 @@ from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure import extreme
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, divisions, overall, parts
 from reslrb_cli.measure.extreme import MOST_CASES, WAYS, run_case
-from reslrb_cli.measure.gradients import integrator
+from reslrb_cli.measure.gradients import integrator, seeds
+from reslrb_cli.measure.scenes import case as scenes_case
+from reslrb_cli.measure.scenes.case import Differences
 from reslrb_cli.measure.scenes.catalogue import CASES, TAGGED
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Verdict
 
@@ -71,6 +73,45 @@ def test_images_with_heavy_tails_are_open_only_for_a_reason():
     known = replace(case, open_ended={extreme.IMAGE: "a reason"})
     found = extreme._images(known, ours, stock, family)
     assert (found.verdict, found.message) == (Verdict.HEAVY_TAILED, "a reason")
+
+
+class Polynomial:
+    """Stand-in for a `Case` of three parameters, with derivatives (1, 2, 3) and a third-order term along each axis."""
+
+    size = 3
+
+    def __init__(self) -> None:
+        self.taken: list[tuple[range, int, float, str]] = []
+
+    def directions(self, count: int) -> np.ndarray:
+        return np.array([[1.0, -1.0, 0.5], [-0.5, 1.0, -1.0]])[:count]
+
+    def differences(self, _tracer: Any, along: np.ndarray, seeds: range, spp: int, step: float, sides: str = "both"
+                    ) -> np.ndarray:  # fmt: skip
+        self.taken.append((seeds, spp, step, sides))
+        return np.tile(along @ [1, 2, 3] + 5 * step**2, (len(seeds), 1))
+
+
+@pytest.mark.parametrize("name", ["albedo_0", "albedo_0_roulette", "opacity_0.4", "slope_0"])
+def test_differences_along_random_directions_and_amplitudes(name: str, monkeypatch: pytest.MonkeyPatch):
+    case, setup, options = CASES[name], Polynomial(), list[dict[str, Any]]()
+    monkeypatch.setattr(scenes_case, "integrator", lambda _name, **given: options.append(given))
+    source = case.source
+    assert isinstance(source, Differences)
+    found = source.samples(case, setup)
+    roulette = "rr_depth" in case.options
+    assert options == [{"max_depth": case.options["max_depth"]}], "without roulette"
+    assert found.paired is not roulette
+    near = (seeds(case.seeds, 1 if roulette else 0), case.spp, source.step, source.sides)
+    assert found.values.shape == (case.seeds, source.directions(setup))
+    if source.left is None:
+        assert setup.taken == [near]
+        expected = setup.directions(2) if source.sides == "both" else np.abs(setup.directions(2))
+        np.testing.assert_array_equal(found.along, expected)
+        return
+    assert setup.taken == [near, (*near[:2], 2 * source.step, "both")]
+    np.testing.assert_allclose(found.values[0], [1, 2, 3])
+    np.testing.assert_allclose(found.bias, 0.5 * source.step**2 + source.left * np.sqrt(14 / 3))
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import Family, compare_expectations, entry_count
+from reslrb_cli.measure.methods import NEVER
 from reslrb_cli.measure.processes import Ended
 from reslrb_cli.records.measurements import BenchStatus, Verdict
 
@@ -115,13 +116,25 @@ def test_written_files(tmp_path: Path) -> None:
     assert "about 5.9 GiB at 1024 spp" in said
 
 
+@pytest.mark.parametrize("by", [OWN, "stack", "walk_ad", "ptracer", "prb"])
+def test_compared_methods_differ_in_no_more_than_the_estimator(config: Config, by: str) -> None:
+    changed, own = comparable(config, by), config.integrator.options()
+    options = changed.integrator.options()
+    assert options["rr_depth"] == NEVER
+    assert all(options[name] == own[name] for name in ("max_depth", "hide_emitters"))
+    assert changed.integrator.type == (by if by in ("walk_ad", "ptracer", "prb") else "reslrb")
+    if changed.integrator.type in ("reslrb", "walk_ad"):
+        assert options["filter_normalization"] == "detached"
+    if changed.integrator.type == "reslrb":
+        assert options["attached_sampling"] == "follow"
+        assert options["estimator"] == (own["estimator"] if by == OWN else by)
+
+
 @pytest.mark.long
 def test_compared_methods_have_one_expectation(config: Config) -> None:
     """The comparison disables every part of our method that naive AD lacks."""
     y, x = np.mgrid[0:16, 0:16] / 16
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)
-    options = comparable(config, OWN).integrator.options()
-    assert (options["filter_normalization"], options["attached_sampling"]) == ("detached", "follow")
     kinds, pictures = [Kind(by, 64, by) for by in (OWN, "ptracer")], take_pictures(config, 16)
     pictures.arrays["adjoints"] = adjoint[None]
     for kind in kinds:
