@@ -104,7 +104,7 @@ class Gradcheck:
                 exact = ours and ESTIMATORS[listed.options["estimator"]].exact
                 for reference in parts.references(key, listed):
                     kind = Kind.EQUAL_SEEDS if exact and reference is Reference.WALK_AD else Kind.EXPECTATION
-                    found.append(Row(key, listed.label, reference, kind, parts.ways[listed.label]))
+                    found.append(Row(key, listed.label, reference, kind, parts.way(listed, reference)))
         return sorted(found, key=lambda row: row.key is not None and row.reference.value in NAIVE)
 
     def conditions(self) -> str:
@@ -233,6 +233,8 @@ class Gradcheck:
         figures = Comparison(Verdict.UNRESOLVED)
         if count > 1 or row.kind is Kind.EQUAL_SEEDS:
             figures = self._figures(row, count, family)
+        if figures.verdict is Verdict.FAILS and row.reference is Reference.FINITE_DIFFERENCE:
+            figures = replace(figures, message=self.participants.lacking(row.way) or figures.message)
         if figures.verdict is Verdict.UNRESOLVED and count < min(self.seeds, TAIL_SEEDS):
             figures = replace(figures, message=f"{count} of {self.seeds} seeds are too few to know the noise: {why}")
         return self._record(row, figures, count)
@@ -275,7 +277,8 @@ class Gradcheck:
         parts = self.participants
         rows = [
             (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION, way), parts.why[way.named(key)])
-            for way in parts.each_way for key in parts.case.keys if parts.stock[way.named(key)] is None
+            for way in dict.fromkeys(parts.way(listed, Reference.PTRACER) for listed in parts.listed)
+            for key in parts.case.keys if parts.stock[way.named(key)] is None
         ]  # fmt: skip
         rows += [
             (Row(None, "reslrb", Reference.PATH, Kind.IMAGE, way), why)

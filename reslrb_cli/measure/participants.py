@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.integrators import PLAIN, traced_paths
+from reslrb_cli.config.integrators import AUTO_ESTIMATOR, PLAIN, ReslrbConfig, traced_paths
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.estimators import ATTACHED
@@ -33,11 +33,13 @@ from reslrb_cli.measure.references import (
 )
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.loading import check_integrator
+from reslrb_cli.optimization.loading import check_integrator, paths_of, what_moves
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import multiple_of
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import value_shape
+from reslrb_cli.scene.deformation import Moves
+from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.visibility import interior
 
 #: Light paths of one gradient, rounded to whole samples per pixel.
@@ -56,6 +58,9 @@ ALIKE: dict[Reference, dict[str, str]] = {
     Reference.PTRACER: {"attached_sampling": "follow", "filter_normalization": "detached"},
     Reference.FINITE_DIFFERENCE: {"filter_normalization": "attached", "edges": "on"},
 }
+
+#: References that are compared with light paths if light moves: they do not follow it along other paths.
+OF_LIGHT_PATHS = (Reference.WALK_AD, Reference.PTRACER, Reference.PRB, Reference.FORWARD_MODE)
 
 #: Integrator of the differenced images: ours, without roulette if paths have a maximum length.
 DIFFERENCED = "differenced"
@@ -169,8 +174,9 @@ class Way:
 class Participants:
     """The loaded scene with every integrator by its label. A variant must be set.
 
-    - `ways` maps the label of each estimator to the estimator's paths. Dictionaries "by way" have the names for light
-        paths first, then the names for other paths (`Way.named`).
+    - `ways` maps the label of each estimator to the estimator's paths. If light moves, the paths are those of a run,
+        but `OF_LIGHT_PATHS` are compared with the estimator's light paths (`way`). Dictionaries "by way" have names for
+        each kind of paths (`Way.named`).
     - `stock` has the stock reference for each parameter's gradient, or None. `why` has the reasons against the other
         stock references.
     - `images` has the reference of the image for each way. `exact` has gradients in closed form.
@@ -199,16 +205,14 @@ class Participants:
         self.spp = settings.spp or multiple_of(max(most, 1), problem.samples_per_pass)
         self._situation = Situation.of_problem(problem, sensor)
         self.attached, self._moved = self._situation.attached, self._situation.moved
-        nodes = [self.case.params.properties[key][2] for key in self._moved]
+        self._nodes = [self.case.params.properties[key][2] for key in self._moved]
         self.forward_mode = not any(
-            isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in nodes
+            isinstance(node, mi.Emitter) or (isinstance(node, mi.Shape) and node.is_emitter()) for node in self._nodes
         )
+        self._moves = what_moves(first, problem.selection) if self._moved else Moves.NOTHING
         self.listed = self._able(settings, problem)
-        self.ways = {
-            case.label: Way() if self._moved and case.type == "reslrb" else Way.of(self._configs[case.label])
-            for case in self.listed
-        }
-        self.each_way = list(dict.fromkeys(self.ways.values()))
+        self.ways = {case.label: self._way(case, problem) for case in self.listed}
+        self.each_way = list(dict.fromkeys(self.way(case, one) for one in Reference for case in self.listed))
         self.unguided: dict[str, str] = {}
         self.integrators: dict[str, StepIntegrator] = {}
         #: The experiment and the options that determine an integrator, by its label.
@@ -242,6 +246,8 @@ class Participants:
                 self._check(case, self._configs[case.label], problem)
             except ConfigError as error:
                 refused[case.label] = error
+            if self._moved and "paths" in case.options and not settings.named:  # the others have the paths of a run
+                refused.setdefault(case.label, ConfigError("--integrators", case.label, "repeats another estimator"))
         listed = [case for case in settings.integrators if case.label not in refused]
         if refused and (settings.named or not listed):
             raise next(iter(refused.values()))
@@ -249,14 +255,45 @@ class Participants:
 
     def _check(self, case: NamedIntegrator, config: Config, problem: Problem) -> None:
         """Raise ConfigError if the estimator cannot render the scene or, if light moves, differentiate it."""
-        ours, estimator = case.type == "reslrb", case.options.get("estimator")
-        if not self._moved:
-            check_integrator(config, config.integrator, problem.scene, problem.sensors)
-        elif ours and case.options.get("paths", "light") != "light":
-            raise ConfigError("--integrators", case.label, "only light paths have derivatives of moving light")
-        if self.attached and ours and estimator not in ATTACHED:
+        integrator, estimator, asked = config.integrator, case.options.get("estimator"), case.options.get("paths")
+        if not isinstance(integrator, ReslrbConfig):
+            check_integrator(config, integrator, problem.scene, problem.sensors)
+            return
+        if self.attached and estimator not in ATTACHED:
             reason = f"{estimator} has no derivatives of moving light; use {', '.join(ATTACHED)}"
             raise ConfigError("--integrators", "", reason)
+        if self._moved:
+            paths = self._way(case, problem).paths
+            if paths == "light" and asked not in (None, "light"):
+                reason = "only light paths have derivatives of moving lamps, and derivatives that follow everywhere"
+                raise ConfigError("--integrators", case.label, reason)
+            if paths == "camera" and estimator != AUTO_ESTIMATOR:
+                reason = f"a run has only camera paths, and {estimator} has none; use reslrb:{estimator}(paths=light)"
+                raise ConfigError("--integrators", case.label, reason)
+            integrator = integrator.model_copy(update={"paths": paths})
+        check_integrator(config, integrator, problem.scene, problem.sensors, self._moves)
+
+    def _way(self, case: NamedIntegrator, problem: Problem) -> Way:
+        """Return the paths of a case. If light moves, a case that names no paths has those of a run."""
+        config = self._configs[case.label]
+        if not self._moved or not isinstance(config.integrator, ReslrbConfig):
+            return Way.of(config)
+        asked = case.options.get("paths", self._config.integrator.options().get("paths", "auto"))
+        integrator = config.integrator.model_copy(update={"paths": asked})
+        paths = paths_of(integrator, problem.scene, problem.sensors, self._moves)
+        return Way(paths, integrator.light_share) if paths == "both" else Way(paths)
+
+    def way(self, case: NamedIntegrator, reference: Reference) -> Way:
+        """Return the paths of a case that are compared with `reference`."""
+        light = self._moved and case.type == "reslrb" and reference in OF_LIGHT_PATHS
+        return Way() if light else self.ways[case.label]
+
+    def lacking(self, way: Way) -> str:
+        """Return a known cause why derivatives of these paths differ from differences, or an empty text."""
+        smooth = (isinstance(node, mi.Shape) and interpolates_normals(node) for node in self._nodes)
+        if way.paths != "light" or not any(smooth):
+            return ""
+        return "light paths lack terms of moving meshes with interpolated normals; paths=both and camera have them"
 
     def _add(self, label: str, kind: str, config: Config | None = None, **options: Any) -> None:
         self.integrators[label] = make_integrator(kind, **options)
@@ -274,8 +311,8 @@ class Participants:
             self.integrators[label], self._origins[label] = own, (config, {"type": kind} | options)
             return
         guiding, asked = options["guiding"], self._config.integrator.options().get("guiding", "off")
-        if self._moved:  # as in the run
-            options |= {"paths": "light", "light_share": PLAIN["light_share"]}
+        if self._moved and kind == "reslrb":
+            options |= {"paths": "light", "light_share": PLAIN["light_share"]} | self.ways[label].options
         if kind == "reslrb":  # as in a run
             options["freeze"] = True
             if (place := getattr(config.integrator, "file", None)) is not None:
@@ -286,8 +323,9 @@ class Participants:
             self._add(_alike(label, Reference.UNGUIDED), kind, config, **options | {"guiding": "on"})
             self._add(self.unguided[label], kind, config, **options | {"guiding": "off"})
         edgeless = (self._config.integrator.options() | case.options).get("edges") == "off"
-        for reference, alike in ALIKE.items() if self.attached else ():
-            alike = alike | {"edges": "off"} if edgeless else alike
+        for reference in Reference if self.attached else ():
+            alike = ALIKE.get(reference, {}) | ({"edges": "off"} if edgeless else {})
+            alike |= {"paths": self.way(case, reference).paths}
             if options | alike != options:
                 self._add(_alike(label, reference), kind, config, **options | alike)
 
@@ -331,7 +369,7 @@ class Participants:
         """Return the references that the scene allows for the gradient of a parameter by an integrator."""
         if listed.type == "custom" and self._moved:  # our camera paths have no derivatives of moving light
             return [Reference.FINITE_DIFFERENCE]
-        stock = self.stock[self.ways[listed.label].named(key)]
+        stock = self.stock[self.way(listed, Reference.PTRACER).named(key)]
         found = [Reference.WALK_AD] + ([] if stock is None else [stock])
         found += [Reference.ANALYTIC] if key in self.exact else []
         found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
@@ -372,7 +410,8 @@ class Participants:
         if kind in ("gradient", "image"):
             return of
         _, way = self._of[of]
-        ours = [case.label for case in self.listed if case.type == "reslrb" and self.ways[case.label] == way]
+        able = [case for case in self.listed if case.type == "reslrb" and self.way(case, Reference.FORWARD_MODE) == way]
+        ours = [self.sampled(case.label, Reference.FORWARD_MODE) for case in able]
         return way.named(DIFFERENCED) if kind == "differences" else [*ours, way.named("walk_ad")][0]
 
     def about(self, kind: str, of: str) -> dict[str, Any]:

@@ -90,9 +90,10 @@ def integrator_name(record: GradcheckRecord) -> str:
     """Return the name of the integrator, such as `reslrb:stack`. The name includes the kind of paths if the integrator
     does not use light paths.
     """
-    if record.estimator is None and record.paths != "light":
-        return f"{record.integrator}(paths={record.paths})"
-    return record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"
+    name = record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"
+    if record.paths == "light" or "paths=" in name:
+        return name
+    return f"{name.removesuffix(')')}{',' if name.endswith(')') else '('}paths={record.paths})"
 
 
 def reference_name(record: GradcheckRecord) -> str:
