@@ -332,14 +332,15 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
 
     origin, records = lines[0], [line for line in lines if "verdict" in line]
     z, distance = (max(record[limit] or 0.0 for record in records) for limit in ("z_max_limit", "relative_l2_limit"))
-    estimators = list(dict.fromkeys(record["estimator"] for record in records))
+    labels = list(dict.fromkeys(record["label"] for record in records))
+    names = [label.removeprefix("reslrb:") for label in labels]
     rows = []
     for case in dict.fromkeys(record["case"] for record in records):
         own = [record for record in records if record["case"] == case]
         kinds = {image: dict.fromkeys(record["reference"] for record in own if (record["kind"] == "image") is image)
                  for image in (False, True)}  # fmt: skip
         references = [*kinds[False], *(f"image: {name}" for name in kinds[True])]
-        cells = [_suite_cell([record for record in own if record["estimator"] == name]) for name in estimators]
+        cells = [_suite_cell([record for record in own if record["label"] == label]) for label in labels]
         named = ", ".join(references).replace("finite_difference", "differences")
         rows.append([f"`{case}`", CASES[case].about, named, str(own[0]["seeds"]), *cells])
     opened = "".join(f"- {text}\n" for text in open_comparisons(suite_summary(lines))) or "None.\n"
@@ -354,7 +355,7 @@ def extreme_page(lines: Sequence[Mapping[str, Any]]) -> str:
         f"(limit {distance:.0e}). Comparisons that fail or stay open are in bold.\n"
         "[Check gradients](gradcheck.md) explains references and verdicts.\n\n"
         f"## Open comparisons\n\n{opened}\n"
-        f"## Cases\n\n{table(('case', 'subject', 'references', 'seeds', *estimators), rows)}\n"
+        f"## Cases\n\n{table(('case', 'subject', 'references', 'seeds', *names), rows)}\n"
     )
 
 

@@ -89,8 +89,7 @@ def _filled(text: str) -> str:
 
 def name_of(row: Row) -> str:
     """Return the name of an integrator. For an estimator of `reslrb`, this is the name of the estimator alone."""
-    name = row["estimator"] or row["integrator"]
-    return f"`{name}`" + (f" of {row['capacity']}" if row.get("capacity") not in (None, 1) else "")
+    return f"`{row['label'].removeprefix('reslrb:')}`"
 
 
 def figure(value: float | None, digits: int = 3) -> str:
@@ -112,7 +111,7 @@ def bench_ratios(record: Record, swept: str) -> str:
     found: dict[str, dict[int, Row]] = {}
     for row in record.rows:
         found.setdefault(name_of(row), {})[row[key]] = row
-    base = {row[key]: row for row in record.rows if row["integrator"] == "ptracer"}
+    base = {row[key]: row for row in record.rows if row["label"] == "ptracer"}
     lines = []
     for name, of in found.items():
         peaks = sorted(row["peak_mib"] for row in of.values() if row["status"] == "ok")

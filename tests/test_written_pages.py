@@ -313,13 +313,12 @@ def test_the_paths_of_a_run_match_its_manifest(needed: bool, reason: str, shown:
 
 
 def test_ratios_are_of_medians() -> None:
-    def row(integrator: str, estimator: str | None, depth: int, time: float, status: str = "ok") -> dict:
+    def row(label: str, depth: int, time: float, status: str = "ok") -> dict:
         times = {"median": time, "min": time, "max": time}
-        return {"integrator": integrator, "estimator": estimator, "capacity": None, "max_depth": depth,
-                "status": status, "kernel_ms": times, "peak_mib": float(depth)}  # fmt: skip
+        return {"label": label, "max_depth": depth, "status": status, "kernel_ms": times, "peak_mib": float(depth)}
 
-    rows = [row("ptracer", None, 2, 8.0), row("reslrb", "stack", 2, 4.0), row("ptracer", None, 4, 1.0, "out_of_memory"),
-            row("reslrb", "stack", 4, 5.0)]  # fmt: skip
+    rows = [row("ptracer", 2, 8.0), row("reslrb:stack", 2, 4.0), row("ptracer", 4, 1.0, "out_of_memory"),
+            row("reslrb:stack", 4, 5.0)]  # fmt: skip
     made = pages.bench_ratios(pages.Record({}, rows), "depth")
     assert made.splitlines()[2:] == ["| `ptracer` | 1.00 | out of memory | 2.0 |", "| `stack` | 0.50 | | 2.0 to 4.0 |"]
 
@@ -351,7 +350,7 @@ def suite_lines() -> list[dict[str, Any]]:
     """Return the lines of a run of the extreme suite with two cases, of which the second has an open comparison."""
 
     def record(case: str, estimator: str, z_max: float, verdict: str = "holds", message: str = "") -> dict[str, Any]:
-        return {"case": case, "parameter": "floor.reflectance.data", "integrator": "reslrb", "estimator": estimator,
+        return {"case": case, "parameter": "floor.reflectance.data", "label": f"reslrb:{estimator}", "options": {},
                 "kind": "expectation", "reference": "ptracer", "seeds": 8, "verdict": verdict, "z_max": z_max,
                 "z_max_limit": 5.9, "relative_l2": None, "relative_l2_limit": None, "message": message}  # fmt: skip
 

@@ -450,7 +450,7 @@ def convergence(
 
     - `integrators`, `reference`: as for `--integrators` and `--reference`.
     - `budget`: total time in seconds.
-    - `rounds`: number of rounds, regardless of `budget`.
+    - `rounds`: number of rounds, regardless of `budget`. Default: 64, within `budget`.
     - `spps`: sample counts per pixel to compare.
     - `draws`: file that keeps all draws. Draws that it has are not drawn again.
     - `allow_code`: permit running the files of your own integrators.
@@ -464,13 +464,12 @@ def convergence(
         from reslrb_cli.measure.convergence import Session
         from reslrb_cli.measure.draws import DrawsFile
         from reslrb_cli.measure.judgement import Judgement
-        from reslrb_cli.measure.methods import ConvergencePlan
+        from reslrb_cli.measure.methods import convergence_plan
         from reslrb_cli.report.tables import result_lines
 
         _check_counts(rounds=[rounds], spps=spps)
-        plan = ConvergencePlan.of(
-            config, objective, integrators, reference, budget_s=budget, rounds=rounds, spps=tuple(dict.fromkeys(spps))
-        )
+        values = tuple(dict.fromkeys(spps))
+        plan = convergence_plan(config, objective, integrators, reference, values, budget_s=budget, rounds=rounds)
         file = DrawsFile(None if draws is None else as_path(draws, "draws", "a file"))
         session = Session(plan, stop, logger.info, spent_s=time.monotonic() - began, file=file)
         for _ in session.run():
@@ -499,7 +498,7 @@ def bench(
     - `integrators`: as for `--integrators`.
     - `values`: path depths, or samples per pixel with `sweep="spp"`. Default: those of the command.
     - `budget`: total time in seconds.
-    - `rounds`: number of rounds, regardless of `budget`.
+    - `rounds`: number of rounds, regardless of `budget`. Default: 9, within `budget`.
     - `allow_code`: permit running the files of your own integrators.
 
     Each integrator runs in its own process with the experiment's variant. The calling process sets no variant. An
@@ -509,18 +508,18 @@ def bench(
     with called() as stop:
         config = _for_processes(experiment, allow_code)
         from reslrb_cli.measure.bench import Bench
-        from reslrb_cli.measure.methods import DEEPEST, Sweep
+        from reslrb_cli.measure.methods import DEEPEST, bench_plan
 
         if sweep not in get_args(Swept):
             raise ConfigError("sweep", "", f"is {sweep!r}; there are {', '.join(get_args(Swept))}")
         _check_counts(rounds=[rounds], values=values)
-        plan = Sweep.of(config, sweep, tuple(values), integrators, DEEPEST, budget_s=budget, rounds=rounds)
+        plan = bench_plan(config, sweep, tuple(values), integrators, DEEPEST, budget_s=budget, rounds=rounds)
         session = Bench(plan, stop, logger.info, spent_s=time.monotonic() - began)
         for _ in session.run():
             pass
         if stop():
             raise KeyboardInterrupt
-        return [result.record for result in session.results()]
+        return session.results()
 
 
 def _for_processes(experiment: Experiment, allow_code: bool) -> Config:

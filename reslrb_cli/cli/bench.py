@@ -25,11 +25,9 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.methods import BENCHED, DEEPEST, Sweep
+from reslrb_cli.measure.methods import BENCHED, DEEPEST, Plan, bench_plan, plays_roulette
 
 if TYPE_CHECKING:
-    from reslrb_cli.config.schema import Config
-    from reslrb_cli.measure.bench import BenchResult
     from reslrb_cli.records.measurements import BenchRecord
 
 
@@ -79,38 +77,31 @@ def command(**given: Any) -> int:
         reason = "needs --sweep depth" if values is None else "has no effect with --values"
         raise ConfigError("--max-depth", "", f"{reason}; use --set integrator.max_depth={options.max_depth}")
     check_writable("--json", json_file)
-    sweep = Sweep.of(
+    plan = bench_plan(
         config, swept, values or (), options.integrators, options.max_depth, budget_s=options.budget,
         rounds=options.rounds,
     )  # fmt: skip
-    results, interrupted = _run(sweep, json_file, began)
-    states = {result.record.status for result in results}
+    results, interrupted = _run(plan, json_file, began)
+    states = {record.status for record in results}
     return exit_code(interrupted, BenchStatus.OK in states, states)
 
 
-def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[BenchResult], bool]:
+def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[list[BenchRecord], bool]:
     """Measure, print and write. Return all results, and True if the user interrupted."""
     from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
 
-    table, notes = bench_columns([case.label for case in sweep.cases], sweep.swept), []
-
-    def show(rows: list[BenchResult]) -> None:
-        for row in rows:
-            echo(table.line(bench_cells(row)))
-            if row.reason:
-                notes.append(f"{sweep.name(row.value)}, {row.case.label}: {row.reason}")
-
-    def lines() -> list[BenchRecord]:
-        return [row.record for row in session.results()]
-
+    table, notes = bench_columns([case.label for case in plan.cases], plan.swept), []
     say = logging.getLogger(__name__).info
-    with measuring(Bench, sweep, began, say) as (session, interrupts):
-        keeper = Keeper(json_file, origin_of(sweep.variant), lines)
-        echo(_conditions(sweep.config, sweep))
+    with measuring(Bench, plan, began, say) as (session, interrupts):
+        keeper = Keeper(json_file, origin_of(plan.variant), session.results)
+        echo(_conditions(plan))
         echo(table.head())
-        for rows in session.run():
-            show(rows)
+        for records in session.run():
+            for record in records:
+                value = record.method.spp if plan.swept == "spp" else record.method.max_depth
+                echo(table.line(bench_cells(record, value)))
+                notes += [f"{plan.swept} {value}, {record.method.label}: {record.message}"] if record.message else []
             keeper.refresh()
         keeper.finish(interrupts.requested)
         for note in notes:
@@ -118,13 +109,13 @@ def _run(sweep: Sweep, json_file: Path | None, began: float) -> tuple[list[Bench
         return session.results(), interrupts.requested
 
 
-def _conditions(config: Config, sweep: Sweep) -> str:
+def _conditions(plan: Plan) -> str:
     """Describe the measurement in one line."""
-    rr_depth, own = config.integrator.rr_depth, config.integrator.max_depth
-    deepest = max(sweep.values) if sweep.swept == "depth" else own
-    roulette = f"roulette from depth {rr_depth}" if sweep.plays_roulette(deepest) else "no roulette"
+    config, own = plan.config, plan.config.integrator
+    deepest = max(plan.values) if plan.swept == "depth" else own.max_depth
     parts = [str(config.source)]
-    parts += [] if sweep.swept == "depth" else [f"depth {own}"]
-    parts += [] if sweep.swept == "spp" else [f"{config.run.spp} spp"]
-    limit = "" if sweep.memory_limit is None else f", {sweep.memory_limit / 2**30:.2f} GiB each"
-    return ", ".join([*parts, roulette, "dL/dI known in advance", f"ratios to {sweep.baseline.label}{limit}"])
+    parts += [] if plan.swept == "depth" else [f"depth {own.max_depth}"]
+    parts += [] if plan.swept == "spp" else [f"{config.run.spp} spp"]
+    parts.append(f"roulette from depth {own.rr_depth}" if plays_roulette(deepest, own.rr_depth) else "no roulette")
+    limit = "" if plan.memory_limit is None else f", {plan.memory_limit / 2**30:.2f} GiB each"
+    return ", ".join([*parts, "dL/dI known in advance", f"ratios to {plan.baseline.label}{limit}"])

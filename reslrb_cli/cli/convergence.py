@@ -23,12 +23,13 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
+from reslrb_cli.measure.methods import Plan, convergence_plan, plays_roulette
+from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.convergence import Session
     from reslrb_cli.measure.judgement import ConvergenceResults
-    from reslrb_cli.measure.methods import ConvergencePlan
 
 
 @dataclass(frozen=True)
@@ -75,27 +76,25 @@ def command(**given: Any) -> int:
     from reslrb_cli.config.loader import check_code
 
     load_packages()  # before the imports below need them
-    from reslrb_cli.measure.methods import ConvergencePlan
 
     config, objective, json_file = options.config(), options.objective, options.json_file
     if objective == "loss":
         check_code(config)
     check_writable("--json", json_file)
     check_writable("--draws", options.draws)
-    plan = ConvergencePlan.of(
-        config, objective, options.integrators, options.reference, budget_s=options.budget, rounds=options.rounds,
-        spps=options.spps or (),
+    plan = convergence_plan(
+        config, objective, options.integrators, options.reference, options.spps or (), budget_s=options.budget,
+        rounds=options.rounds,
     )  # fmt: skip
     results, interrupted = _run(plan, options, began)
     done = any(record.relative_rmse is not None for record in results.methods)
     return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
-def _run(plan: ConvergencePlan, options: ConvergenceOptions, began: float) -> tuple[ConvergenceResults, bool]:
+def _run(plan: Plan, options: ConvergenceOptions, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
     from reslrb_cli.measure.convergence import Session
     from reslrb_cli.measure.draws import DrawsFile
-    from reslrb_cli.measure.engine import Role
     from reslrb_cli.measure.judgement import Judgement
     from reslrb_cli.report.tables import (
         closing_sentence,
@@ -117,8 +116,8 @@ def _run(plan: ConvergencePlan, options: ConvergenceOptions, began: float) -> tu
                 table = _table(session)
                 echo(table.head())
             judgement = Judgement(session)
-            for member in session.of(Role.CASE):
-                if judgement.ready and member.refusal is None:
+            for member in session.of("case"):
+                if judgement.ready and member.status is not BenchStatus.REFUSED:
                     echo(table.line(method_cells(judgement.overall(member), f"{rounds} rounds")))
         keeper.finish(interrupts.requested)
         results = Judgement(session).results()
@@ -137,22 +136,21 @@ def _run(plan: ConvergencePlan, options: ConvergenceOptions, began: float) -> tu
 
 def _table(session: Session) -> Columns:
     """Return a table with columns that fit the finished and the expected results of the session."""
-    from reslrb_cli.measure.engine import Role
     from reslrb_cli.report.tables import method_columns
 
-    labels = [member.request.label for member in session.of(Role.CASE)]
+    labels = [member.label for member in session.of("case")]
     return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])
 
 
-def _conditions(plan: ConvergencePlan, session: Session) -> str:
+def _conditions(plan: Plan, session: Session) -> str:
     """Describe the measurement in one line."""
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth
-    roulette = f"roulette from depth {rr_depth}" if plan.plays_roulette(depth) else "no roulette"
-    what = {"fixed": "dL/dI fixed", "loss": f"loss {loss_words(config.losses)}", "image": "the image"}[plan.objective]
-    if plan.objective != "image" and any(spec.regularizers for spec in config.parameters):
+    roulette = f"roulette from depth {rr_depth}" if plays_roulette(depth, rr_depth) else "no roulette"
+    what = {"fixed": "dL/dI fixed", "loss": f"loss {loss_words(config.losses)}", "image": "the image"}[plan.quantity]
+    if plan.quantity != "image" and any(spec.regularizers for spec in config.parameters):
         what += ", without the regularizers, which have no noise"
-    spp = ", ".join(str(count) for count in plan.spps or [config.run.spp])
+    spp = ", ".join(map(str, plan.values))
     parts = [str(config.source), f"{spp} spp", roulette, what, facts.get("pictures", "")]
     parts.append(WITHOUT_BORDER if facts.get("masked") else "")
     return ", ".join(part for part in parts if part)

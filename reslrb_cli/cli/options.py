@@ -29,7 +29,7 @@ from reslrb_cli.records.measurements import BenchStatus
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.engine import Engine
-    from reslrb_cli.measure.methods import Measurement
+    from reslrb_cli.measure.methods import Plan
 
 
 def origin_of(variant: str) -> Origin:
@@ -82,7 +82,7 @@ E = TypeVar("E", bound="Engine")
 
 @contextmanager
 def measuring(
-    kind: Callable[..., E], plan: Measurement, began: float, say: Callable[[str], None] = echo, **options: Any
+    kind: Callable[..., E], plan: Plan, began: float, say: Callable[[str], None] = echo, **options: Any
 ) -> Iterator[tuple[E, Interrupts]]:
     """Yield a session that measures `plan`, and the session's `Interrupts`. The session's processes end with it.
 
@@ -134,7 +134,7 @@ class Counts(click.ParamType):
 budget_option = click.option(
     "--budget", type=click.FloatRange(min=0), default=240.0, show_default=True, metavar="SECONDS",
     help=
-        "Time limit, including loading and compiling. Measurements without time are named.",
+        "Time limit, including loading and compiling. A measurement ends earlier after its usual number of rounds.",
 )  # fmt: skip
 
 
@@ -211,7 +211,7 @@ def comparison_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `ComparisonOptions` to a command, except CONFIG, `--set` and `--integrators`."""
     rounds = click.option(
         "--rounds", type=click.IntRange(min=1, max=COUNT.max), metavar="N",
-        help="Number of steps of each integrator, for any time: the same steps on every machine.",
+        help="Number of rounds, without a time limit: the same steps on every machine.",
     )  # fmt: skip
     return allow_code_option(budget_option(rounds(json_option(function))))
 

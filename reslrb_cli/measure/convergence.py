@@ -6,7 +6,6 @@ only turns that are not on file are taken.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -15,10 +14,10 @@ import numpy as np
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.draws import StoredResults, mixed_sessions, situation
-from reslrb_cli.measure.engine import NO_TIME, Engine, Member, Request, Role
+from reslrb_cli.measure.engine import NO_TIME, Engine, Member, Role
 from reslrb_cli.measure.gradients import places
-from reslrb_cli.measure.methods import ConvergencePlan, NamedIntegrator
-from reslrb_cli.measure.processes import CannotStart
+from reslrb_cli.measure.methods import ROUNDS, NamedIntegrator, Plan
+from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
 from reslrb_cli.records.decisions import key_of
 from reslrb_cli.records.measurements import BenchStatus
 
@@ -32,7 +31,7 @@ INDEPENDENT_PATHS = 2**18
 FEWEST = 3
 
 #: Steps of a turn. The first one refills the caches.
-TURN = {Role.CASE: 2, Role.REFERENCE: 8, Role.INDEPENDENT: 4}
+TURN: dict[Role, int] = {"case": 2, "reference": 8, "independent": 4}
 
 
 class Session(Engine):
@@ -43,11 +42,9 @@ class Session(Engine):
     is measured.
     """
 
-    def __init__(
-        self, plan: ConvergencePlan, stop: Callable[[], bool], say: Callable[[str], None], **given: Any
-    ) -> None:
-        super().__init__(plan, stop, say, **given)
-        self.plan, self.rounds = plan, 0
+    def __init__(self, plan: Plan, stop: Callable[[], bool], say: Callable[[str], None], **given: Any) -> None:
+        super().__init__(plan, stop, say, ROUNDS, **given)
+        self.rounds = 0
         self.judges: dict[str, Member] = {}
         self.facts: Mapping[str, Any] = {}
         self._arrays: Mapping[str, np.ndarray] = {}
@@ -59,18 +56,22 @@ class Session(Engine):
 
     def of(self, role: Role) -> list[Member]:
         """Return the members of one role."""
-        return [member for member in self.members if member.request.role is role]
+        return [member for member in self.members if member.role == role]
 
     def mixed_sessions(self) -> str:
         """Return a warning if efficiencies compare times of several sessions, or an empty text."""
-        return mixed_sessions(member.draws for member in self.of(Role.CASE))
+        return mixed_sessions(member.draws for member in self.of("case"))
 
     def measure(self) -> Iterator[int]:
         """Measure. Yields the number of completed rounds after each round."""
         if self._survey():
             self._add_members()
             yield from self._take_turns()
-        self._say_what_lacks()
+            late = [member.label for member in self.members if member.status is BenchStatus.OK and not member.kept]
+            if late:
+                self.say(f"not measured: {', '.join(late)}: {NO_TIME}")
+            elif self.is_late() and self.rounds < FEWEST:
+                self.say(f"results need {FEWEST} rounds: {NO_TIME}")
 
     # --- before the rounds --------------------------------------------------------------------------------------------
 
@@ -80,25 +81,25 @@ class Session(Engine):
 
     def _survey(self) -> bool:
         """Find the references, and make dL/dI. Returns false if time is up."""
-        plan, objective = self.plan, self.plan.objective
-        self._survey_about = self._about(plan.reference_config, objective=objective, spp=plan.config.run.spp)
+        plan, objective = self.plan, self.plan.quantity
+        assert plan.reference is not None, "this is no bench"
+        config = plan.of_reference(plan.reference)
+        self._survey_about = self._about(config, objective=objective, spp=plan.config.run.spp)
         stored = self.file.stored(self._survey_about)
         if stored is None:
-            referee = Member(file=self.file, request=Request(
-                case=plan.reference, config=plan.reference_config, label="survey", quantity=objective, spp=0,
-                purpose="", about=self._survey_about,
-            ))  # fmt: skip
-            referee.process = self.launch(plan.reference_config, "begin_survey", objective=objective)
-            with contextlib.closing(referee):
-                found = self.open(referee)
-            if referee.failure is not None:
-                memory = referee.status is BenchStatus.OUT_OF_MEMORY
+            process = self.launch(config, "begin_survey", objective=objective)
+            try:
+                stored = StoredResults(**self.hear(process))
+            except Ended as end:
+                memory = end.status is BenchStatus.OUT_OF_MEMORY
                 code = ExitCode.OUT_OF_MEMORY if memory else ExitCode.CHECK_FAILED
-                raise CannotStart(f"--reference {plan.reference.label}: {referee.failure.reason}", code)
-            if found is None:
-                self.say(f"dL/dI was not computed: {NO_TIME}")
+                raise CannotStart(f"--reference {plan.reference.label}: {end.reason}", code) from None
+            except Stopped:
+                if self.is_late():
+                    self.say(f"dL/dI was not computed: {NO_TIME}")
                 return False
-            stored = StoredResults(**found)
+            finally:
+                process.close()
             self.file.store(self._survey_about, stored)
         self.facts, self._arrays = stored.facts, stored.arrays
         return True
@@ -119,42 +120,33 @@ class Session(Engine):
             self.say(f"left out: {label}: {reason}")
         for case, spp in plan.entries:
             if case.label not in left_out:
-                self._add(Role.CASE, case, plan.config_of(case, spp), plan.objective)
+                self._add("case", case, plan.at(case, spp))
         reference = plan.settled_reference(facts["paths"])
-        known = reference.at(plan.config, plan.config.integrator.max_depth, True)
-        noise_free = "image" if plan.objective == "image" else "fixed"
-        self._add(Role.REFERENCE, reference, known, noise_free)
+        self._add("reference", reference, plan.of_reference(reference))
         for name in dict.fromkeys(name for name in facts["independent"].values() if name is not None):
-            config = plan.independent_config(name)
-            same = [] if plan.objective == "loss" else [m for m in self.of(Role.CASE) if m.request.config == config]
-            case = NamedIntegrator(name, name, {})
-            self.judges[name] = same[0] if same else self._add(Role.INDEPENDENT, case, config, noise_free)
+            judge = plan.independent_reference(name)
+            config = plan.of_reference(judge)
+            same = [] if plan.quantity == "loss" else [m for m in self.of("case") if m.config == config]
+            self.judges[name] = same[0] if same else self._add("independent", judge, config)
         for key, reason in facts["why"].items():
             if facts["independent"][key] is None:
                 self.say(f"{key}: no independent reference ({reason}); biases are judged by {reference.label}")
 
-    def _add(self, role: Role, case: NamedIntegrator, config: Config, quantity: str) -> Member:
-        plan, spp = self.plan, config.run.spp
-        if role is Role.INDEPENDENT and config.integrator.options().get("samples_per_pass") is None:
+    def _add(self, role: Role, case: NamedIntegrator, config: Config) -> Member:
+        plan, spp, count = self.plan, config.run.spp, TURN[role]
+        if role == "independent" and config.integrator.options().get("samples_per_pass") is None:
             spp = min(spp, max(INDEPENDENT_PATHS // self.facts["pixels"], 1))
-        method = plan.method(case, config, spp, quantity != "loss", role is not Role.CASE)
-        purpose = f"convergence, {role.value} {case.label}, {spp} spp"
-        request = Request(
-            case=case,
-            config=config,
-            label=method.label,
-            quantity=quantity,
-            spp=spp,
-            purpose=purpose,
-            about=self._about(
-                config, quantity=quantity, purpose=purpose, count=TURN[role], dL_dI=key_of(self._survey_about)
-            ),
-            count=TURN[role],
-            may_refuse=role is Role.INDEPENDENT or (role is Role.CASE and plan.default),
-            role=role,
-            method=method,
-        )
-        member = Member(request=request, file=self.file)
+        quantity = plan.quantity if role == "case" or plan.quantity == "image" else "fixed"
+        several = role == "case" and list(plan.values) != [plan.config.run.spp]
+        purpose = f"convergence, {role} {case.label}, {spp} spp"
+        about = self._about(
+            config, quantity=quantity, purpose=purpose, count=count, dL_dI=key_of(self._survey_about)
+        )  # fmt: skip
+        member = Member(
+            case=case, config=config, label=f"{case.label}, {spp} spp" if several else case.label, quantity=quantity,
+            spp=spp, purpose=purpose, about=about, file=self.file, count=count,
+            may_refuse=role == "independent" or (role == "case" and plan.default), role=role,
+        )  # fmt: skip
         self.members.append(member)
         return member
 
@@ -162,59 +154,39 @@ class Session(Engine):
 
     def _take_turns(self) -> Iterator[int]:
         self.rounds = max((len(member.kept) for member in self.members), default=0)
-        if self.plan.rounds is None and self.rounds:
-            self.pace.most = self.rounds  # a method without draws gets as many as the others have
-            self.say(f"{self.file.path} has {self.rounds} rounds; --rounds adds more")
-        lacking = [m for m in self.members if self._is_possible(m) and not m.kept.issuperset(range(self.pace.most))]
+        lacking = [m for m in self.members if self._is_possible(m) and not m.kept.issuperset(range(self.most))]
         for member in lacking:
-            own = member.request
-            if changed := self.file.differences(own.about):
-                self.say(f"{own.label}: draws on file are of other {', '.join(changed)}, so they are not used")
+            if changed := self.file.differences(member.about):
+                self.say(f"{member.label}: draws on file are of other {', '.join(changed)}, so they are not used")
         for member in self.begin(lacking, self._arrays):
             self._say_start(member)
-        if not self._is_worthwhile(lacking):
+        usable = {member.role for member in self.members if member.process is not None or member.kept}
+        if not usable.issuperset(("case", "reference")):
             return
         size = sum(int(np.prod(shape, dtype=int)) for shape in self.facts["shapes"].values())
-        fitting = MEMORY // (4 * size * sum(member.request.count for member in self.members))
-        if fitting < self.pace.most:
-            self.pace.most = max(fitting, FEWEST + 1)
-            self.say(f"the memory for draws ends after {self.pace.most} rounds")
+        fitting = MEMORY // (4 * size * sum(member.count for member in self.members))
+        if fitting < self.most:
+            self.most = max(fitting, FEWEST + 1)
+            self.say(f"the memory for draws ends after {self.most} rounds")
         for done in self.take_rounds():
             self.rounds = max(self.rounds, done)
             yield done
 
     def _is_possible(self, member: Member) -> bool:
         """Return False if an earlier session found that the method does not support the scene."""
-        stored = self.file.stored(member.request.about)
-        if stored is not None and member.request.may_refuse:
-            member.end = CannotStart(stored.facts["refusal"], ExitCode.USAGE)
-            self.say(f"left out: {member.request.label}: {member.end}")
-        return member.end is None
-
-    def _is_worthwhile(self, started: list[Member]) -> bool:
-        """Return True if a case and the reference have draws or a process, and the time suffices for results."""
-        usable = {member.request.role for member in self.members if member.alive or member.kept}
-        round_s = sum(member.request.count * member.step_s for member in started if member.alive)
-        return {Role.CASE, Role.REFERENCE} <= usable and self.pace.fits(FEWEST * round_s)
+        stored = self.file.stored(member.about)
+        if stored is not None and member.may_refuse:
+            member.status, member.reason = BenchStatus.REFUSED, stored.facts["refusal"]
+            self._say_start(member)
+        return member.status is BenchStatus.OK
 
     def _say_start(self, member: Member) -> None:
         """Print how a member started, or how it ended."""
-        own, draws = member.request, member.draws
-        if member.refusal is not None:
-            self.say(f"left out: {own.label}: {member.refusal}")
-            if member.refusal.exit_code == ExitCode.USAGE:
-                self.file.store(own.about, StoredResults({"refusal": str(member.refusal)}, {}))
-        elif member.failure is not None:
-            self.say(f"{own.label}: {member.status.value}: {member.failure.reason}")
-        elif member.alive:
-            what = "" if own.role is Role.CASE else f" ({own.role.value})"
+        if member.status is BenchStatus.REFUSED:
+            self.say(f"left out: {member.label}: {member.reason}")
+        elif member.status is not BenchStatus.OK:
+            self.say(f"{member.label}: {member.status.value}: {member.reason}")
+        elif member.process is not None:
+            what, draws = "" if member.role == "case" else f" ({member.role})", member.draws
             took = f"first step {(draws.cold_ms or 0) / 1e3:.1f} s, then {member.step_s:.3g} s"
-            self.say(f"{own.label}{what}: {took}, {draws.peak_mib or 0:.0f} MiB")
-
-    def _say_what_lacks(self) -> None:
-        """Print which results need more time than the budget allowed."""
-        late = [member.request.label for member in self.members if member.late]
-        if late:
-            self.say(f"not measured: {', '.join(late)}: {NO_TIME}")
-        elif self.plan.rounds is None and self.rounds < FEWEST:
-            self.say(f"results need {FEWEST} rounds: {NO_TIME}")
+            self.say(f"{member.label}{what}: {took}, {draws.peak_mib or 0:.0f} MiB")

@@ -19,7 +19,7 @@ from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_equal_seeds, compare_expectations, entry_count
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
-from reslrb_cli.measure.methods import parse_cases, records_of
+from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.references import Situation, prb_image
 from reslrb_cli.measure.scenes.case import ReferenceGradients, SceneCase
 from reslrb_cli.measure.scenes.catalogue import CASES, IMAGE, PRB, PTRACER
@@ -149,8 +149,8 @@ def _run_way(case: SceneCase, setup: Case, members: Mapping[str, str], family: F
 def _record(
     case: SceneCase, label: str, parameter: str | None, other: Reference, kind: Kind, found: Comparison
 ) -> GradcheckRecord:
-    way = records_of(split(label)[1])
-    return GradcheckRecord(case.name, parameter, "reslrb", label, other, kind, case.seeds, **vars(found), **way)
+    name, way = f"reslrb:{label}", split(label)[1]
+    return GradcheckRecord(case.name, parameter, name, way, other, kind, case.seeds, **vars(found))
 
 
 def _steps(case: SceneCase, setup: Case, name: str) -> tuple[np.ndarray, np.ndarray, list[int]]:

@@ -35,7 +35,7 @@ from reslrb_cli.measure.comparison import (
 from reslrb_cli.measure.draws import Draws, DrawsFile, StoredResults
 from reslrb_cli.measure.engine import NO_TIME
 from reslrb_cli.measure.gradients import seeds
-from reslrb_cli.measure.methods import plays_roulette, records_of
+from reslrb_cli.measure.methods import plays_roulette
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
@@ -266,11 +266,8 @@ class Gradcheck:
         return compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
 
     def _record(self, row: Row, figures: Comparison, seeds: int) -> GradcheckRecord:
-        kind, _, estimator = row.label.partition(":") if row.label.startswith("reslrb") else (row.label, "", "")
-        return GradcheckRecord(
-            str(self.settings.config.source), row.key, kind, estimator or None, row.reference, row.kind, seeds,
-            **vars(figures), **records_of(row.way.options),
-        )  # fmt: skip
+        case, sides = str(self.settings.config.source), (row.reference, row.kind)
+        return GradcheckRecord(case, row.key, row.label, row.way.options, *sides, seeds, **vars(figures))
 
     def _without_reference(self) -> Iterator[GradcheckRecord]:
         """Yield records for parameters without a stock reference."""

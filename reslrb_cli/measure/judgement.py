@@ -33,11 +33,13 @@ from reslrb_cli.measure.comparison import (
     tail_weight,
 )
 from reslrb_cli.measure.convergence import FEWEST, Session
-from reslrb_cli.measure.engine import Member, Role
+from reslrb_cli.measure.engine import Member
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     FEWEST_AVERAGES,
     TARGETS,
+    BenchStatus,
+    Bias,
     Method,
     MethodRecord,
     PointRecord,
@@ -81,30 +83,28 @@ class JackknifeEstimate:
 
 
 class ReferenceMean:
-    """The reference of errors: the mean of (K, P) rows, with K at least 2."""
+    """The reference of errors: the mean of (K, P) rows, with K at least 2.
+
+    `moved` (1 + K, P), `noises` and `signals` (1 + K,) are the change of the mean, the noise and the signal, first for
+    all rows, and then without each row.
+    """
 
     def __init__(self, rows: np.ndarray) -> None:
-        self.rows = rows.astype(np.float64)
+        self.rows, count = rows.astype(np.float64), len(rows)
         self.mean = self.rows.mean(0)
-        self.noise = float(self.rows.var(0, ddof=1).sum() / len(self.rows))
-        self.signal = float(self.mean @ self.mean) - self.noise
+        deviations = self.rows - self.mean
+        squares = np.square(deviations).sum(1)
+        # Leaving out a row lowers the sum of squares about the mean by K / (K - 1) times its own square.
+        left = (squares.sum() - squares * count / (count - 1)) / max(count - 2, 1) / (count - 1)
+        self.noises = np.array([squares.sum() / (count - 1) / count, *left])
+        self.moved = np.concatenate([np.zeros_like(deviations[:1]), -deviations / (count - 1)])
+        self.signals = np.square(self.mean + self.moved).sum(1) - self.noises
+        self.noise, self.signal = float(self.noises[0]), float(self.signals[0])
 
     @property
     def floor(self) -> float | None:
         """The reference's own relative standard error, or None if its signal is not significant."""
         return float(np.sqrt(self.noise / self.signal)) if self.signal > 0 else None
-
-    @cached_property
-    def without(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Leave-one-out results for each row: the change of the mean (K, P), the noise (K,) and the signal (K,)."""
-        count, deviations = len(self.rows), self.rows - self.mean
-        moved = -deviations / (count - 1)
-        squares = np.square(deviations).sum(1)
-        # Leaving out a row lowers the sum of squares about the mean by K / (K - 1) times its own square.
-        left = squares.sum() - squares * count / (count - 1)
-        noise = left / max(count - 2, 1) / (count - 1)
-        signal = np.square(self.mean + moved).sum(1) - noise
-        return moved, noise, signal
 
 
 class MethodSamples:
@@ -165,13 +165,13 @@ class MethodSamples:
         count, reference = len(averages), self.reference
         if squared <= 0 or count < FEWEST_AVERAGES:
             return None, None
-        squares, value = np.square(averages).sum(1), np.log(squared / reference.signal)
-        moved, noises, signals = reference.without
-        own = ((squares.sum() - squares) / (count - 1) - reference.noise) / reference.signal
-        other = squares.mean() - 2 * moved @ averages.mean(0) + np.square(moved).sum(1) - noises
+        squares, mean = np.square(averages).sum(1), averages.mean(0)
+        own = np.array([squares.mean(), *(squares.sum() - squares) / (count - 1)]) - reference.noise
+        moved = np.square(reference.moved).sum(1) - 2 * reference.moved @ mean
+        other = (squares.mean() + moved - reference.noises) * reference.signal / reference.signals
         # the delta method, because leaving out a row may lower an error below 0
-        relative = [value + side * reference.signal / squared for side in (own, other / signals)]
-        found = _joined(value, *relative).exponential()
+        value = np.log(squared / reference.signal) - 1
+        found = _jackknife(value + own / squared, value + other / squared).exponential()
         return float(np.sqrt(found.low)), float(np.sqrt(found.high))
 
     def slope(self) -> float | None:
@@ -197,27 +197,24 @@ class MethodSamples:
         turns, reference = int(self.turns.max()) + 1, self.reference
         if turns < FEWEST or len(self.seconds) != turns or self.variance <= 0 or reference.signal <= 0:
             return None
-        sums = np.zeros((turns, self.deviations.shape[1]))
-        np.add.at(sums, self.turns, self.deviations)
-        squares = np.bincount(self.turns, np.square(self.deviations).sum(1), turns)
-        counts = self.count - np.bincount(self.turns, minlength=turns)
+        # Each array has the value of all turns first, then the values without each turn.
+        counts = self.count - np.array([0, *np.bincount(self.turns, minlength=turns)])
         if counts.min() < 2:
             return None
-        total = sums.sum(0)
-        left_sums = total @ total - 2 * sums @ total + np.square(sums).sum(1)
-        seconds = (self.seconds.sum() - self.seconds) / (turns - 1)
-        own = _error(squares.sum() - squares, left_sums, counts, reference.noise)
-        whole = _error(squares.sum(), total @ total, self.count, reference.noise)
-        moved, noises, signals = reference.without
-        if min(float(own.min()), float(whole), float(signals.min())) <= 0:
+        sums = np.zeros((1 + turns, self.deviations.shape[1]))
+        np.add.at(sums, 1 + self.turns, self.deviations)
+        means = (self.deviations.sum(0) - sums) / counts[:, None]
+        total, squares = np.square(self.deviations).sum(1), np.zeros(1 + turns)
+        np.add.at(squares, 1 + self.turns, total)
+        distances = np.square(means).sum(1)
+        variances = (total.sum() - squares - counts * distances) / (counts - 1)
+        seconds = np.array([self.step_s, *(self.seconds.sum() - self.seconds) / (turns - 1)])
+        own = np.maximum(distances - variances / counts - reference.noise, 0.0) + variances
+        other = np.square(means[0] - reference.moved).sum(1) - variances[0] / self.count - reference.noises
+        other = np.maximum(other, 0.0) + variances[0]
+        if min(own.min(), other.min(), reference.signals.min()) <= 0:
             return None
-        variance = self.variance * reference.signal
-        distance = np.square(total / self.count - moved).sum(1) - variance / self.count - noises
-        other = np.maximum(distance, 0.0) + variance
-        value = np.log(reference.signal) - np.log(float(whole)) - np.log(self.step_s)
-        left = np.log(reference.signal) - np.log(own) - np.log(seconds)
-        right = np.log(signals) - np.log(other) - np.log(self.step_s)
-        return _joined(float(value), left, right)
+        return _jackknife(np.log(reference.signal / own / seconds), np.log(reference.signals / other / self.step_s))
 
     def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
         """Return the seconds until the relative error is `error`. Also return a boolean that is true if the seconds are
@@ -235,24 +232,19 @@ class MethodSamples:
         return steps * self.step_s, bool(steps > self.count or floor is None or error < floor)
 
 
-def _error(squares: np.ndarray, sums: np.ndarray, counts: np.ndarray | int, noise: float) -> np.ndarray:
-    """Return the sum of the variance of a step and the squared bias.
-
-    `squares` are sums of |deviation|^2, and `sums` are |sum of deviations|^2.
-    """
-    variance = (squares - sums / counts) / (counts - 1)
-    return np.asarray(np.maximum(sums / np.square(counts) - variance / counts - noise, 0.0) + variance)
-
-
-def _joined(value: float, left: np.ndarray, right: np.ndarray) -> JackknifeEstimate:
+def _jackknife(own: np.ndarray, other: np.ndarray) -> JackknifeEstimate:
     """Return an estimate with the jackknife variances of the samples and of the reference. Welch and Satterthwaite's
     rule combines the two variances.
+
+    Both arrays have the estimate first. The other values of `own` leave out some samples, and those of `other` leave
+    out a row of the reference.
     """
-    sides = [side for side in (left, right) if len(side) > 1]
+    sides = [side[1:] for side in (own, other) if len(side) > 2]
     variances = [float(jackknife_variance(side)) for side in sides]
     total = sum(variances)
     spread = sum(v**2 / (len(side) - 1) for v, side in zip(variances, sides, strict=True))
-    return JackknifeEstimate(value, float(np.sqrt(total)), total**2 / spread if spread > 0 else float(len(left) - 1))
+    freedom = total**2 / spread if spread > 0 else float(len(own) - 2)
+    return JackknifeEstimate(float(own[0]), float(np.sqrt(total)), freedom)
 
 
 # --- results of a session ---------------------------------------------------------------------------------------------
@@ -268,37 +260,26 @@ class ConvergenceResults:
     remark: str = ""
 
 
-@dataclass(frozen=True)
-class _Bias:
-    """Bias of one parameter, or the worst bias of all parameters. The fields are as in a `MethodRecord`."""
-
-    biased: bool | None = None
-    bias_z: float | None = None
-    bias_z_limit: float | None = None
-    bias_reference: str | None = None
-    message: str = ""
-
-
 class Judgement:
     """Evaluation of the samples of a session so far."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._slices = session.slices() if session.facts else {}
-        #: References of the errors, by parameter and for all; empty if there are too few steps of the reference.
-        self._whole: dict[str, ReferenceMean] = {}
         #: Each parameter's slice, and the slice of all parameters together if there are several.
         self._places = self._slices if len(self._slices) == 1 else self._slices | {ALL: slice(None)}
-        for found in session.of(Role.REFERENCE):
-            if len(found.kept) >= FEWEST and not _flaw(found):
-                self._whole = {key: ReferenceMean(self._rows(found, place)) for key, place in self._places.items()}
+        #: References of the errors, by parameter and for all; empty if there are too few steps of the reference.
+        self._whole = {
+            key: ReferenceMean(self._rows(found, place))
+            for found in session.of("reference") if _is_usable(found) for key, place in self._places.items()
+        }  # fmt: skip
 
     def _rows(self, member: Member, place: slice) -> np.ndarray:
         """Return the independent estimates that a reference member has made, (K, P): the means of its turns. If there
         are several dL/dI, turns with the same dL/dI are combined.
         """
         turns, rows = member.turns, member.draws.values[:, place].astype(np.float64)
-        if self._session.plan.objective == "loss" and len(member.kept) > IMAGES:
+        if self._session.plan.quantity == "loss" and len(member.kept) > IMAGES:
             turns = turns % IMAGES
         return np.stack([rows[turns == turn].mean(0) for turn in np.unique(turns)])
 
@@ -310,32 +291,30 @@ class Judgement:
     def overall(self, member: Member) -> MethodRecord:
         """Return the figures of all parameters together, or of the image, without biases."""
         key = next(reversed(self._places))
-        return self._method(member, key, _Bias())
+        return self._method(member, key, Bias())
 
     def results(self) -> ConvergenceResults:
         """Return all records."""
-        session = self._session
-        cases, references = session.of(Role.CASE), session.of(Role.REFERENCE)
-        points: list[PointRecord] = []
-        methods: list[MethodRecord] = []
-        judged = {member.request.label: self._biases(member) for member in cases if self._measured(member)}
-        own = self._biases(references[0]) if self.ready else {}
-        for member in cases:
-            if member.refusal is not None:
+        session, points, methods = self._session, list[PointRecord](), list[MethodRecord]()
+        reference = next(iter(session.of("reference")), None)
+        own = self._biases(reference) if reference is not None and self.ready else {}
+        for member in session.of("case"):
+            if member.status is BenchStatus.REFUSED:
                 continue
+            biases = self._biases(member) if self._is_measured(member) else {}
             for key in self._places:
-                methods.append(self._method(member, key, judged.get(member.request.label, {}).get(key, _Bias()), own))
+                methods.append(self._method(member, key, biases.get(key, Bias()), own))
                 if self._has_figures(member, key):
-                    points += self._samples(member, key).points(_method(member), key)
-        stood = [self._stood(references[0], key, own[key]) for key in self._places] if self.ready else []
+                    points += self._samples(member, key).points(member.method, key)
+        stood = [self._stood(reference, key, bias) for key, bias in own.items() if reference is not None]
         return ConvergenceResults(points, methods, stood, session.mixed_sessions())
 
-    def _measured(self, member: Member) -> bool:
+    def _is_measured(self, member: Member) -> bool:
         """Whether a member has enough finite samples."""
-        return self.ready and member.failure is None and len(member.draws) >= FEWEST and not _flaw(member)
+        return self.ready and member.status is BenchStatus.OK and _is_usable(member)
 
     def _has_figures(self, member: Member, key: str) -> bool:
-        return self._measured(member) and self._whole[key].floor is not None
+        return self._is_measured(member) and self._whole[key].floor is not None
 
     # --- bias ---------------------------------------------------------------------------------------------------------
 
@@ -344,15 +323,13 @@ class Judgement:
         reference.
         """
         session = self._session
-        reference = session.of(Role.REFERENCE)[0]
+        reference = session.of("reference")[0]
         stock = session.judges.get(session.facts["independent"][key] or "")
-        if stock is None or stock is member or stock.failure is not None or len(stock.kept) < FEWEST or _flaw(stock):
-            stock = None
-        if stock is not None and stock.request.case.type != member.request.case.type:
+        if stock is not None and stock is not member and _is_usable(stock) and stock.case.type != member.case.type:
             return stock
         return None if member is reference else reference
 
-    def _biases(self, member: Member) -> dict[str, _Bias]:
+    def _biases(self, member: Member) -> dict[str, Bias]:
         """Return the bias for each parameter, and the worst bias if there are several parameters."""
         found = {key: self._bias(member, key) for key in self._slices}
         if len(found) == 1:
@@ -365,12 +342,12 @@ class Judgement:
         found[ALL] = replace(worst, biased=biased, bias_reference=judges, message=message)
         return found
 
-    def _bias(self, member: Member, key: str) -> _Bias:
+    def _bias(self, member: Member, key: str) -> Bias:
         judge, place = self._judge(member, key), self._slices[key]
         if judge is None:
-            return _Bias(message="there is no independent reference")
+            return Bias(message="there is no independent reference")
         ours, theirs = member.draws.values[:, place].astype(np.float64), self._rows(judge, place)
-        if member.request.role is not Role.CASE:
+        if member.role != "case":
             ours = self._rows(member, place)
         figures = compare_expectations(
             ours,
@@ -382,11 +359,11 @@ class Judgement:
         )
         biased = {Verdict.HOLDS: False, Verdict.FAILS: True}.get(figures.verdict)
         message = figures.message or ("gradient and reference differ" if biased else "")
-        return _Bias(biased, figures.z_max, figures.z_max_limit, judge.request.label, message)
+        return Bias(figures.z_max, figures.z_max_limit, judge.label, biased, message)
 
     def _family(self) -> Family:
         """Return all comparisons of the session, which have a common correction."""
-        members = len(self._session.of(Role.CASE)) + 1
+        members = len(self._session.of("case")) + 1
         shapes = self._session.facts["shapes"].values()
         return Family(members * len(shapes), members * sum(entry_count(tuple(shape)) for shape in shapes))
 
@@ -395,17 +372,15 @@ class Judgement:
     def _samples(self, member: Member, key: str) -> MethodSamples:
         return MethodSamples(member.draws.values[:, self._places[key]], member.turns, member.seconds, self._whole[key])
 
-    def _method(
-        self, member: Member, key: str, bias: _Bias, references: dict[str, _Bias] | None = None
-    ) -> MethodRecord:
+    def _method(self, member: Member, key: str, bias: Bias, references: dict[str, Bias] | None = None) -> MethodRecord:
         draws = member.draws
-        figures: dict[str, Any] = {"method": _method(member), "parameter": key, "status": member.status}
+        figures: dict[str, Any] = {"method": member.method, "parameter": key, "status": member.status}
         figures |= {"repeats": len(draws), "cold_s": None if draws.cold_ms is None else draws.cold_ms / 1e3}
         if not self._has_figures(member, key):
-            reason = _flaw(member) or ("" if member.failure is None else member.failure.reason)
+            reason = _flaw(member) or member.reason
             if (rounds := self._session.plan.rounds) is not None and rounds < FEWEST:
                 reason = reason or f"results need {FEWEST} rounds; set --rounds"
-            reason = reason or ("the budget was spent" if member.late or not self._measured(member) else _UNSEEN)
+            reason = reason or (_UNSEEN if self._is_measured(member) else "the budget was spent")
             return MethodRecord(**figures, message=reason)
         samples, biased = self._samples(member, key), bias.biased is True
         magnitude = samples
@@ -433,21 +408,22 @@ class Judgement:
             **vars(replace(bias, message=message)),
         )
 
-    def _stood(self, member: Member, key: str, bias: _Bias) -> ReferenceRecord:
+    def _stood(self, member: Member, key: str, bias: Bias) -> ReferenceRecord:
         floor = self._whole[key].floor
         bias = bias if floor is not None else replace(bias, message=_UNSEEN)
-        return ReferenceRecord(_method(member), key, len(member.draws), floor, **vars(bias))
+        figures: dict[str, Any] = {"repeats": len(member.draws), "reference_rmse": floor}
+        return ReferenceRecord(method=member.method, parameter=key, **figures, **vars(bias))
 
 
 def _kin(member: Member) -> str:
     """Return the source of the code that traces a member's paths: `reslrb` or a stock integrator."""
-    name = member.request.case.type
+    name = member.case.type
     return name if name in ("ptracer", "prb") else "ours"
 
 
-def _method(member: Member) -> Method:
-    assert member.request.method is not None, "members of a convergence have one"
-    return member.request.method
+def _is_usable(member: Member) -> bool:
+    """Whether a member has enough finite samples for a standard error."""
+    return len(member.kept) >= FEWEST and not _flaw(member)
 
 
 def _flaw(member: Member) -> str:

@@ -1,14 +1,14 @@
-"""The methods that measurements compare (`NamedIntegrator`), and the plans of measurements. Does not import Mitsuba.
+"""The methods that measurements compare (`NamedIntegrator`), and the plans of `bench` and `convergence` (`Plan`). Does
+not import Mitsuba.
 
-A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`. `Sweep` is the plan of the command `bench`.
-`ConvergencePlan` is the plan of the command `convergence`.
+A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,14 +19,12 @@ from reslrb_cli.config.integrators import (
     ESTIMATOR_OPTIONS,
     PLAIN,
     AnyIntegrator,
-    LightTracerOptions,
     ReslrbConfig,
 )
 from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import parse
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records.measurements import Method
 
 #: Options that a case inherits from the configuration's integrator if its own integrator has them.
 SHARED = (
@@ -38,32 +36,12 @@ SHARED = (
 PATHS_OPTIONS = ("paths", "light_share")
 
 
-def records_of(options: Mapping[str, Any], usual: str = "light") -> dict[str, Any]:
-    """Return `paths` and `light_share` of an integrator's options for records. `usual` are the paths without such an
-    option. `light_share` is None unless `paths` is `both`.
-    """
-    paths, share = str(options.get("paths", usual)), float(options.get("light_share", PLAIN["light_share"]))
-    return {"paths": paths, "light_share": share if paths == "both" else None}
-
-
-def paths_in_records(config: Config) -> dict[str, Any]:
-    """Return an integrator's `paths` and `light_share` for records. `paths` is `auto` if the run chooses the kinds of
-    paths by measurement.
-    """
-    usual = "light" if isinstance(config.integrator, LightTracerOptions) else "camera"
-    return records_of(config.integrator.options(), usual)
-
-
 #: The estimator of a case that names none, as in the plugin.
 PLUGIN_ESTIMATOR = "reservoir"
 
 #: Options of `run` that a case can set for itself.
 ADJOINT = ("adjoint", "batches")
 _TYPES = {str(kind.model_fields["type"].default): kind for kind in get_args(get_args(AnyIntegrator)[0])}
-
-#: Options that records show with the estimator's name.
-_ESTIMATOR_OPTIONS = {option for options in ESTIMATOR_OPTIONS.values() for option in options} - {"capacity"}
-_ESTIMATOR_OPTIONS |= set(PLAIN)
 
 _OPTION = "--integrators"
 #: A user's own integrator.
@@ -119,21 +97,6 @@ class NamedIntegrator:
         if getattr(made.integrator, "file", None) is not None and not config.allows_code:
             raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
         return made
-
-    @property
-    def estimator(self) -> str | None:
-        """Name of a `reslrb` estimator with its non-default options except `capacity`. None for other integrators."""
-        if self.type != "reslrb":
-            return None
-        name = str(self.options.get("estimator", PLUGIN_ESTIMATOR))
-        usual = {option: ReslrbConfig.model_fields[option].default for option in _ESTIMATOR_OPTIONS}
-        usual |= {} if name == "auto" else PLAIN
-        other = [
-            f"{option}={value}"
-            for option, value in self.options.items()
-            if option in ADJOINT or (option in usual and value != usual[option])
-        ]
-        return f"{name}({','.join(other)})" if other else name
 
 
 def parse_cases(text: str, source: str = _OPTION) -> list[NamedIntegrator]:
@@ -254,92 +217,14 @@ def with_run(config: Config, **changes: Any) -> Config:
     return config.model_copy(update={"run": config.run.model_copy(update=changes)})
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measurement:
-    """The settings common to all measurements that use processes.
-
-    - `memory_limit` is the limit of each process in bytes, or None.
-    - `device` is the name of the device.
-    - `rounds` is the number of rounds, or None if `budget_s` decides.
-    - `default` tells whether `cases` is the default list. Cases that do not support the scene are then left out.
-    """
-
-    config: Config
-    variant: str
-    cases: Sequence[NamedIntegrator]
-    memory_limit: int | None
-    budget_s: float
-    rounds: int | None = None
-    default: bool = False
-    device: str = ""
-
-    def first(self, config: Config) -> dict[str, Any]:
-        """Return the first message to a process that measures `config`."""
-        return {"config": dump(config), "source": str(config.source), "variant": self.variant,
-                "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
-
-    def plays_roulette(self, depth: int) -> bool:
-        """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded."""
-        return plays_roulette(depth, self.config.integrator.rr_depth)
-
-
 #: Integrators that `bench` compares by default.
 BENCHED = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
 
 #: Greatest depth that `bench` measures by default.
 DEEPEST = 32
 
-
-@dataclass(frozen=True, kw_only=True)
-class Sweep(Measurement):
-    """The plan of `bench`. `bench` measures times relative to `baseline`, at each of the `values` of the `swept`
-    quantity.
-    """
-
-    values: Sequence[int]
-    swept: str = "depth"
-
-    @classmethod
-    def of(
-        cls, config: Config, swept: str, values: Sequence[int], integrators: str | None, max_depth: int, **others: Any
-    ) -> Sweep:
-        """Return a plan from a list of integrators as text. Without `values`, the plan has the default depths up to
-        `max_depth`, or the default sample counts. `others` are further fields. Raises ConfigError.
-        """
-        usual = depths(max_depth) if swept == "depth" else sample_counts(config.run.spp)
-        cases = parse_cases(integrators or BENCHED)
-        own: dict[str, Any] = {"cases": cases, "values": sorted(values or usual), "default": integrators is None}
-        plan = cls(**machine_of(config), **own, config=config, swept=swept, **others)
-        plan.check()
-        return plan
-
-    @property
-    def baseline(self) -> NamedIntegrator:
-        """The first `ptracer` case in the list, or the first case if the list has no `ptracer`."""
-        return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
-
-    def may_refuse(self, case: NamedIntegrator) -> bool:
-        """True if the measurement skips `case` when the case's integrator does not support the scene."""
-        return self.default and case != self.baseline
-
-    def at(self, case: NamedIntegrator, value: int) -> Config:
-        """Return the experiment of one case at one value. Raises ConfigError."""
-        config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
-        depth = value if self.swept == "depth" else config.integrator.max_depth
-        return case.at(config, depth, known=True)
-
-    def name(self, *values: int) -> str:
-        """Format values of the swept quantity, for example `depth 2, 4`."""
-        return f"{self.swept} {', '.join(map(str, values))}"
-
-    def check(self) -> None:
-        """Raise ConfigError if an integrator of the list is invalid."""
-        for case in self.cases:
-            for value in self.values if self.swept == "spp" else self.values[:1]:
-                self.at(case, value)
-
-
-#: Default cases by objective: the gradient with fixed dL/dI, the gradient of the configuration's loss, or the image.
+#: Default cases of `convergence` by objective: the gradient with fixed dL/dI, the gradient of the configuration's loss,
+#: or the image.
 DEFAULTS = {
     "fixed": "ptracer,prb,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,reslrb:stack(guiding=on),"
     "reslrb:stack(paths=camera),reslrb:stack(paths=both)",
@@ -358,14 +243,8 @@ REFERENCES = {
 #: An `rr_depth` at which Russian roulette never starts.
 NEVER = 1_000_000
 
-
-def plays_roulette(depth: int, rr_depth: int) -> bool:
-    """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded.
-
-    The last segment plays no roulette, so roulette needs a `depth` above `rr_depth`.
-    """
-    return not 0 <= depth <= rr_depth
-
+#: Default numbers of rounds of `bench` and of `convergence`.
+BENCH_ROUNDS, ROUNDS = 9, 64
 
 #: Number of images whose dL/dI are used in turn for the configuration's loss. The noise of a single image would look
 #: like a bias of methods that take dL/dI from their own images.
@@ -375,57 +254,79 @@ IMAGES = 8
 ALL = "all"
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConvergencePlan(Measurement):
-    """The plan of `convergence`. Errors are relative to the `reference`. `objective` is a key of `DEFAULTS`.
+def plays_roulette(depth: int, rr_depth: int) -> bool:
+    """Whether paths of at most `depth` segments can meet Russian roulette. A depth of -1 is unbounded.
 
-    `spps` are the samples per pixel of a step. If it is empty, those of `run` are used.
+    The last segment plays no roulette, so roulette needs a `depth` above `rr_depth`.
+    """
+    return not 0 <= depth <= rr_depth
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The plan of `bench` or `convergence`: each of the `cases` at each of the `values` of the `swept` quantity
+    (`depth` or `spp`).
+
+    - `quantity` is the quantity of a draw, as in `steps.Sampler`: `step` for `bench`, otherwise a key of `DEFAULTS`.
+    - `default` tells whether `cases` is the default list. Cases that do not support the scene are then left out.
+    - `budget_s` ends the measurement early, unless the user gave the number of `rounds`.
+    - `reference` is the method whose mean is the reference for errors. `bench` has none.
+    - `memory_limit` is the limit of each process in bytes, or None. `device` is the name of the device.
     """
 
-    objective: str
-    reference: NamedIntegrator
-    spps: Sequence[int] = ()
+    config: Config
+    cases: Sequence[NamedIntegrator]
+    values: Sequence[int]
+    swept: str = "spp"
+    quantity: str = "step"
+    default: bool = False
+    reference: NamedIntegrator | None = None
+    budget_s: float
+    rounds: int | None = None
+    variant: str
+    memory_limit: int | None
+    device: str = ""
 
     @classmethod
-    def of(
-        cls, config: Config, objective: str, integrators: str | None, reference: str | None, **others: Any
-    ) -> ConvergencePlan:
-        """Return a plan from lists as text. None stands for the default list. `others` are further fields. Raises
-        ConfigError.
+    def of(cls, config: Config, integrators: str | None, usual: str, **others: Any) -> Plan:
+        """Return a plan from a list of integrators as text, or from the list `usual`. `others` are further fields.
+        Raises ConfigError if an integrator of the list, or the reference, is invalid.
+
+        The memory limit limits the address space, which does not include the memory of a GPU.
         """
-        if objective not in DEFAULTS:
-            raise ConfigError("objective", "", f"is {objective!r}; there are {', '.join(DEFAULTS)}")
-        cases = parse_cases(integrators or DEFAULTS[objective])
-        stands = parse_cases(reference or REFERENCE, "--reference")
-        if len(stands) != 1:
-            raise ConfigError("--reference", "", "errors are relative to one method; name one")
-        own: dict[str, Any] = {"cases": cases, "reference": stands[0], "default": integrators is None}
-        plan = cls(**machine_of(config), **own, config=config, objective=objective, **others)
-        plan.check()
+        variant, _ = choose(config.variant)
+        limit = None if variant.startswith("cuda") else memory_bytes(variant)
+        plan = cls(config=config, cases=parse_cases(integrators or usual), default=integrators is None, variant=variant,
+                   memory_limit=limit, device=device_name(variant), **others)  # fmt: skip
+        for case, value in plan.entries:
+            plan.at(case, value)
+        if plan.reference is not None:
+            plan.of_reference(plan.reference)
         return plan
 
     @property
-    def known(self) -> bool:
-        """True if dL/dI is known before the image, or is not needed."""
-        return self.objective != "loss"
-
-    @property
     def entries(self) -> list[tuple[NamedIntegrator, int]]:
-        """The compared cases, each with its samples per pixel."""
-        return [(case, spp) for case in self.cases for spp in self.spps or [self.config.run.spp]]
-
-    def config_of(self, case: NamedIntegrator, spp: int) -> Config:
-        """Return the experiment with the integrator of a case and this sample count. Raises ConfigError."""
-        return case.at(with_run(self.config, spp=spp), self.config.integrator.max_depth, self.known)
+        """The compared cases with each value."""
+        return [(case, value) for case in self.cases for value in self.values]
 
     @property
-    def reference_config(self) -> Config:
-        """The experiment with the reference integrator and known dL/dI. Raises ConfigError."""
-        auto = self.reference.label == REFERENCE
-        return self.reference.at(self.config, self.config.integrator.max_depth, True, auto)
+    def baseline(self) -> NamedIntegrator:
+        """The first `ptracer` case in the list, or the first case if the list has no `ptracer`."""
+        return next((case for case in self.cases if case.type == "ptracer"), self.cases[0])
+
+    def at(self, case: NamedIntegrator, value: int) -> Config:
+        """Return the experiment of one case at one value. Raises ConfigError."""
+        config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
+        depth = value if self.swept == "depth" else config.integrator.max_depth
+        return case.at(config, depth, known=self.quantity != "loss")
+
+    def of_reference(self, case: NamedIntegrator) -> Config:
+        """Return the experiment of a reference, which has known dL/dI. Raises ConfigError."""
+        return case.at(self.config, self.config.integrator.max_depth, True, auto=case.label == REFERENCE)
 
     def settled_reference(self, paths: str) -> NamedIntegrator:
         """Return the reference case for the scene's kinds of `paths`. It has edges if any of the cases has."""
+        assert self.reference is not None, "bench has no reference"
         if self.reference.label != REFERENCE:
             return self.reference
         name = REFERENCES[paths]
@@ -433,38 +334,46 @@ class ConvergencePlan(Measurement):
             name = f"{name.removesuffix(')')}{',' if ')' in name else '('}edges=on)"
         return parse_cases(name, "--reference")[0]
 
-    def independent_config(self, name: str) -> Config:
-        """Return the experiment with a stock integrator. `ptracer` runs without Russian roulette, because naive AD with
+    def independent_reference(self, name: str) -> NamedIntegrator:
+        """Return the case of a stock integrator. `ptracer` runs without Russian roulette, because naive AD with
         roulette would be wrong.
         """
-        depth = self.config.integrator.max_depth
-        options = {"rr_depth": NEVER} if name == "ptracer" and self.plays_roulette(depth) else {}
-        return NamedIntegrator(name, name, options, "the independent reference").at(self.config, depth, True)
+        own = self.config.integrator
+        roulette = name == "ptracer" and plays_roulette(own.max_depth, own.rr_depth)
+        return NamedIntegrator(name, name, {"rr_depth": NEVER} if roulette else {}, "the independent reference")
 
-    def check(self) -> None:
-        """Raise ConfigError if an integrator of the list, or the reference, is invalid."""
-        for case, spp in self.entries:
-            self.config_of(case, spp)
-        _ = self.reference_config
+    def name(self, *values: int) -> str:
+        """Format values of the swept quantity, for example `depth 2, 4`."""
+        return f"{self.swept} {', '.join(map(str, values))}"
 
-    def method(self, case: NamedIntegrator, config: Config, spp: int, known: bool, reference: bool) -> Method:
-        """Describe a case for records. `reference` is True for the reference."""
-        options: dict[str, Any] = config.integrator.options()
-        adjoint = None if known else config.adjoint
-        own = {name: value for name, value in case.options.items() if name not in ADJOINT}
-        estimator = replace(case, options=own).estimator
-        label = f"{case.label}, {spp} spp" if self.spps and not reference else case.label
-        capacity = options.get("capacity")
-        depth = config.integrator.max_depth
-        return Method(label, case.type, estimator, capacity, adjoint, spp, **paths_in_records(config), max_depth=depth)
+    def first(self, config: Config) -> dict[str, Any]:
+        """Return the first message to a process that measures `config`."""
+        return {"config": dump(config), "source": str(config.source), "variant": self.variant,
+                "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
 
 
-def machine_of(config: Config) -> dict[str, Any]:
-    """Return the fields of a `Measurement` that describe the machine: variant, device, and memory limit. Raises
-    ConfigError.
-
-    The memory limit limits the address space, which does not include the memory of a GPU.
+def bench_plan(
+    config: Config, swept: str, values: Sequence[int], integrators: str | None, max_depth: int, **others: Any
+) -> Plan:
+    """Return the plan of `bench`. Without `values`, the plan has the default depths up to `max_depth`, or the default
+    sample counts. `others` are further fields. Raises ConfigError.
     """
-    variant, _ = choose(config.variant)
-    limit = None if variant.startswith("cuda") else memory_bytes(variant)
-    return {"variant": variant, "memory_limit": limit, "device": device_name(variant)}
+    usual = depths(max_depth) if swept == "depth" else sample_counts(config.run.spp)
+    return Plan.of(config, integrators, BENCHED, swept=swept, values=sorted(values or usual), **others)
+
+
+def convergence_plan(
+    config: Config, objective: str, integrators: str | None, reference: str | None, spps: Sequence[int], **others: Any
+) -> Plan:
+    """Return the plan of `convergence`. Without `spps`, steps have the samples per pixel of `run`. `others` are further
+    fields. Raises ConfigError.
+    """
+    if objective not in DEFAULTS:
+        raise ConfigError("objective", "", f"is {objective!r}; there are {', '.join(DEFAULTS)}")
+    stands = parse_cases(reference or REFERENCE, "--reference")
+    if len(stands) != 1:
+        raise ConfigError("--reference", "", "errors are relative to one method; name one")
+    values = spps or [config.run.spp]
+    return Plan.of(
+        config, integrators, DEFAULTS[objective], quantity=objective, values=values, reference=stands[0], **others
+    )

@@ -127,7 +127,7 @@ class Sampler:
 
 
 def begin(first: dict[str, Any]) -> Begun:
-    """Start the process of a `Request`. The process first reports the size of film and textures. Each question then
+    """Start the process of a `Member`. The process first reports the size of film and textures. Each question then
     asks for steps (`Sampler.answer`).
     """
     sampler = Sampler(told(first), first["quantity"], first["arrays"])

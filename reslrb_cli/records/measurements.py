@@ -20,11 +20,12 @@ from reslrb_cli.records.metrics import Line, finite
 
 
 class BenchStatus(str, enum.Enum):
-    """Outcome of a case."""
+    """Outcome of a case. Cases that refuse the scene have no records."""
 
     OK = "ok"
     OUT_OF_MEMORY = "out_of_memory"
     FAILED = "failed"
+    REFUSED = "refused"
 
 
 @dataclass(frozen=True)
@@ -42,57 +43,57 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class BenchRecord(Line):
-    """Cost of a step of one integrator at one depth, sample count, film size and texture size.
+class Method:
+    """Measured method: an integrator and the sampling of its steps.
 
-    - `estimator` is None for an integrator without estimators. Options other than the defaults follow the name, for
-        example `reservoir(weight=adjoint)`. The option `capacity` is left out.
+    `label` is the method as the user wrote it. `options` are all options of its integrator, with its `type`. `spp` are
+    the samples per pixel of a step. `adjoint` is `run.adjoint`, or None if dL/dI is fixed or nothing is differentiated.
+    """
+
+    label: str
+    options: Mapping[str, Any]
+    spp: int
+    max_depth: int | None = None
+    adjoint: str | None = None
+
+
+@dataclass(frozen=True)
+class BenchRecord(Line):
+    """Cost of a step of one method, for one film size and texture size.
+
     - `step_ms` is the wall time of warm steps. `kernel_ms` is the part for executing kernels. `codegen_ms` is the part
         for generating kernels, including the lookup in the kernel cache. `tracing_ms` is the remaining part, mostly
         Python.
+    - `step_ratio` and `kernel_ratio` are the method's times divided by the baseline's times, round by round.
     - `cold_ms` is the wall time of the first step in a new process with an empty kernel cache.
     - `peak_mib` is the peak memory of the allocator in the first step, including the scene.
     - `scratch_bytes` is the thread-local memory of a path.
     - `texels` is the texel count of all textures that are parameters.
-    - `paths` are the paths of the integrator (`light`, `camera`, `both`). If `paths` is `both`, `light_share` is the
-        share of light paths.
-    - `label` is the integrator as the user wrote it, and `options` are the options in it.
 
-    Values that were not measured are None. If `status` is not `ok`, no value was measured, and all measured values are
-    None.
+    Values that were not measured are None. If `status` is not `ok`, no value was measured, all measured values are
+    None, and `message` gives the reason.
     """
 
-    integrator: str
-    estimator: str | None
-    capacity: int | None
-    max_depth: int
-    rr_depth: int
-    spp: int
+    method: Method
+    status: BenchStatus
     width: int | None
     height: int | None
-    status: BenchStatus
+    texels: int | None
     step_ms: Spread | None = None
     kernel_ms: Spread | None = None
     codegen_ms: Spread | None = None
     tracing_ms: Spread | None = None
+    step_ratio: Spread | None = None
+    kernel_ratio: Spread | None = None
     cold_ms: float | None = None
     peak_mib: float | None = None
     scratch_bytes: int | None = None
     repeats: int = 0
-    texels: int | None = None
-    paths: str = "light"
-    light_share: float | None = None
-    label: str = ""
-    options: Mapping[str, Any] = field(default_factory=dict)
+    message: str = ""
 
 
 #: Relative errors for which the required time is reported.
 TARGETS = (0.1, 0.03, 0.01)
-
-
-def _column(title: str, width: int) -> dict[str, Any]:
-    """Return the metadata of a field that the table of `convergence` shows."""
-    return {"title": title, "width": width}
 
 
 @dataclass(frozen=True)
@@ -102,27 +103,6 @@ class Range:
     value: float
     low: float
     high: float
-
-
-@dataclass(frozen=True)
-class Method:
-    """Measured method: an integrator and the sampling of its steps.
-
-    `estimator` and `capacity` are None if they do not apply. `adjoint` is `run.adjoint`, or None if dL/dI is fixed or
-    nothing is differentiated. `label` is the method as the user wrote it, and `spp` the samples per pixel of a step.
-    `paths` and `light_share` are as in a `BenchRecord`. With `auto` and None, the run decides. `max_depth` is None in
-    records of older versions.
-    """
-
-    label: str
-    integrator: str
-    estimator: str | None
-    capacity: int | None
-    adjoint: str | None
-    spp: int
-    paths: str = "light"
-    light_share: float | None = None
-    max_depth: int | None = None
 
 
 #: Minimum number of averages for an error that counts. The logarithms of the errors of fewer averages are skewed.
@@ -154,9 +134,24 @@ class PointRecord(Line):
 
 
 @dataclass(frozen=True)
-class MethodRecord(Line):
-    """Summary of the points of one method and parameter. The table of `convergence` shows the fields with a column, in
-    this order, and `seconds_to`.
+class Bias:
+    """Bias of a method for one parameter, or the worst bias of all parameters.
+
+    `bias_z` is the largest deviation from `bias_reference` in standard errors, and `bias_z_limit` its limit. By chance,
+    any value of a measurement exceeds its limit with probability 1e-4. `biased` is None if the bias is undecided.
+    `message` then gives the reason. Without an independent reference, `bias_z` is None.
+    """
+
+    bias_z: float | None = None
+    bias_z_limit: float | None = None
+    bias_reference: str | None = None
+    biased: bool | None = None
+    message: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodRecord(Bias, Line):
+    """Summary of the points of one method and parameter.
 
     - `repeats` is the number of steps.
     - `relative_rmse` is the error of one step, computed from the variance of the steps. `step_s` is the number of
@@ -165,10 +160,7 @@ class MethodRecord(Line):
     - `slope` is d log error / d log seconds.
     - `efficiency` is 1 / ((relative variance + squared relative bias) * seconds). `efficiency_freedom` are the degrees
         of freedom of its interval.
-    - `bias_z` is the largest deviation from `bias_reference` in standard errors. `bias_z_limit` is the limit for
-        `bias_z`. By chance, any value in the table exceeds its limit with probability 1e-4.
-    - `bias` is the relative bias, if there is one. `biased` is None if the bias is undecided. `message` then gives the
-        reason.
+    - `bias` is the relative bias, if there is one.
     - `seconds_to` has the time until averages reach each error (`0.1`, `0.03`, `0.01`). The time is None if a bias
         keeps averages above the error.
     - `extrapolated` lists the errors that need more steps than were measured, or that are below the reference's error.
@@ -181,31 +173,22 @@ class MethodRecord(Line):
     method: Method
     parameter: str
     status: BenchStatus
-    step_s: float | None = field(default=None, metadata=_column("step s", 8))
-    repeats: int = field(default=0, metadata=_column("steps", 5))
+    step_s: float | None = None
+    repeats: int = 0
     cold_s: float | None = None
-    relative_rmse: float | None = field(default=None, metadata=_column("error", 8))
+    relative_rmse: float | None = None
     reference_rmse: float | None = None
-    slope: float | None = field(default=None, metadata=_column("slope", 7))
-    efficiency: Range | None = field(default=None, metadata=_column("efficiency", 24))
+    slope: float | None = None
+    efficiency: Range | None = None
     efficiency_freedom: float | None = None
-    bias_z: float | None = field(default=None, metadata=_column("max |z| (limit)", 16))
-    bias_z_limit: float | None = None
     bias: float | None = None
-    bias_reference: str | None = None
-    biased: bool | None = None
     seconds_to: dict[str, float | None] = field(default_factory=lambda: {f"{target:g}": None for target in TARGETS})
     extrapolated: list[str] = field(default_factory=list)
-    message: str = ""
 
 
-@dataclass(frozen=True)
-class ReferenceRecord(Line):
-    """Reference for the errors: the mean of `repeats` steps, with the relative standard error `reference_rmse`.
-
-    `bias_z` is the reference's largest deviation from an independent reference, as in a `MethodRecord`. Without an
-    independent reference, `bias_z` is None.
-    """
+@dataclass(frozen=True, kw_only=True)
+class ReferenceRecord(Bias, Line):
+    """Reference for the errors: the mean of `repeats` steps, with the relative standard error `reference_rmse`."""
 
     KIND: ClassVar[str] = "reference"
 
@@ -213,11 +196,6 @@ class ReferenceRecord(Line):
     parameter: str
     repeats: int
     reference_rmse: float | None
-    bias_z: float | None = None
-    bias_z_limit: float | None = None
-    bias_reference: str | None = None
-    biased: bool | None = None
-    message: str = ""
 
 
 @dataclass(frozen=True)
@@ -283,13 +261,14 @@ class Compared:
     """Two sides of a comparison: an integrator's gradient for a parameter, and a reference.
 
     `case` is the configuration, or a case of a suite. `parameter` is None if all parameters together or the image are
-    compared. `estimator` is None if the integrator has none. `seeds` is the number of gradients on each side.
+    compared. `label` is the integrator as the user wrote it. `options` are the options of its paths, and empty for
+    light paths. `seeds` is the number of gradients on each side.
     """
 
     case: str
     parameter: str | None
-    integrator: str
-    estimator: str | None
+    label: str
+    options: Mapping[str, Any]
     reference: Reference
     kind: Kind
     seeds: int
@@ -330,10 +309,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class GradcheckRecord(Comparison, Compared, Line):
-    """One comparison: its two sides, the paths (as in a `BenchRecord`) and the outcome."""
-
-    paths: str = "light"
-    light_share: float | None = None
+    """One comparison: its two sides and the outcome."""
 
     def to_json(self) -> str:
         """Return the record as one line of JSON. Numbers that are not finite become null."""
@@ -480,6 +456,9 @@ def record_of(kind: type[R], entry: Mapping[str, Any]) -> R | None:
     """Return the record of class `kind` in `entry`, which is a line read from a file. Return None if the line holds no
     such record. Keys that the class does not have are left out, because a later version may have written them.
     """
+    if "label" not in entry:  # older versions have two fields
+        parts = (entry.get("integrator"), entry.get("estimator"))
+        entry = {**entry, "label": ":".join(filter(None, parts)), "options": {}}
     if "method" in kind.__annotations__:  # its fields are in the line itself
         entry = {**entry, "method": entry}
     try:

@@ -38,18 +38,13 @@ ENDS = (("value", "low", "high"), ("median", "min", "max"), ("median", "low", "h
 
 
 def label(entry: Entry) -> str:
-    """Return an integrator's name as the user wrote it. Records of older versions lack it: return the integrator, the
-    estimator, and the capacity if it differs from the default.
-    """
-    if entry.get("label"):
-        return str(entry["label"])
-    parts = ":".join(str(entry[name]) for name in ("integrator", "estimator") if entry.get(name))
-    return parts + (f", capacity {entry['capacity']}" if entry.get("capacity") not in (None, 1) else "")
+    """Return an integrator's name as the user wrote it. Records of older versions may lack it."""
+    return str(entry.get("label") or entry.get("integrator"))
 
 
 def bench_entries(objects: Sequence[Entry]) -> tuple[list[Entry], str]:
     """Return the cases of a bench, and the field that varies."""
-    entries = [entry for entry in objects if "integrator" in entry and "status" in entry]
+    entries = [entry for entry in objects if "step_ms" in entry]
     return entries, next((name for name in SWEPT if len({entry.get(name) for entry in entries}) > 1), "max_depth")
 
 

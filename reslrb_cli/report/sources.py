@@ -178,7 +178,7 @@ def kind_of(entry: Mapping[str, Any]) -> str | None:
         return "convergence"
     if entry.get("kind") == "missing" or {"reference", "verdict"} <= set(entry):
         return "gradcheck"
-    return "bench" if {"integrator", "status", "step_ms"} <= set(entry) else None
+    return "bench" if {"status", "step_ms"} <= set(entry) else None
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

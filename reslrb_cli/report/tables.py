@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
 
-from reslrb_cli.measure.bench import BenchResult
 from reslrb_cli.measure.comparison import MOST_FREEDOM
 from reslrb_cli.measure.judgement import CONFIDENCE, ConvergenceResults
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
+    BenchRecord,
     BenchStatus,
     GradcheckRecord,
     Kind,
@@ -36,14 +35,16 @@ def bench_columns(labels: Sequence[str], swept: str = "depth") -> Columns:
     return Columns(titles, (7, max(map(len, labels)), 9, 21, 9, 21, 7, 7, 8, 9, 9, 3), "><>")
 
 
-def bench_cells(row: BenchResult) -> tuple[str, ...]:
-    """Return the cells of one result: medians, and ratios with minimum and maximum."""
-    record, named = row.record, (str(row.value), row.case.label)
+def bench_cells(record: BenchRecord, value: int) -> tuple[str, ...]:
+    """Return the cells of one result at the `value` of the swept quantity: medians, and ratios with minimum and
+    maximum.
+    """
+    named = (str(value), record.method.label)
     if record.step_ms is None or record.kernel_ms is None:
         return *named, record.status.value
     return (
-        *named, _milliseconds(record.step_ms), _ratio(row.step_ratio), _milliseconds(record.kernel_ms),
-        _ratio(row.kernel_ratio), _milliseconds(record.codegen_ms), _milliseconds(record.tracing_ms),
+        *named, _milliseconds(record.step_ms), _ratio(record.step_ratio), _milliseconds(record.kernel_ms),
+        _ratio(record.kernel_ratio), _milliseconds(record.codegen_ms), _milliseconds(record.tracing_ms),
         f"{record.cold_ms or 0:.0f}", f"{record.peak_mib or 0:.1f}", str(record.scratch_bytes), str(record.repeats),
     )  # fmt: skip
 
@@ -90,10 +91,10 @@ def integrator_name(record: GradcheckRecord) -> str:
     """Return the name of the integrator, such as `reslrb:stack`. The name includes the kind of paths if the integrator
     does not use light paths.
     """
-    name = record.integrator if record.estimator is None else f"{record.integrator}:{record.estimator}"
-    if record.paths == "light" or "paths=" in name:
+    name, paths = record.label, record.options.get("paths", "light")
+    if paths == "light" or "paths=" in name:
         return name
-    return f"{name.removesuffix(')')}{',' if name.endswith(')') else '('}paths={record.paths})"
+    return f"{name.removesuffix(')')}{',' if name.endswith(')') else '('}paths={paths})"
 
 
 def reference_name(record: GradcheckRecord) -> str:
@@ -165,16 +166,23 @@ def _limited(value: float | None, limit: float | None, spec: str) -> str:
 #: Maximum width of a parameter key.
 KEY_WIDTH = 28
 
-#: Figures of a method with a column of their own.
-FIGURES = [figure for figure in fields(MethodRecord) if "title" in figure.metadata]
+#: Columns of a method: the field, the title and the width.
+FIGURES = (
+    ("step_s", "step s", 8),
+    ("repeats", "steps", 5),
+    ("relative_rmse", "error", 8),
+    ("slope", "slope", 7),
+    ("efficiency", "efficiency", 24),
+    ("bias_z", "max |z| (limit)", 16),
+)
 
 
 def method_columns(labels: Sequence[str], parameters: Sequence[str]) -> Columns:
     """Return the columns of the table. The first two columns fit `labels` and `parameters`."""
-    titles = ("", "parameter", *(figure.metadata["title"] for figure in FIGURES), *(f"s to {t:.0%}" for t in TARGETS))
+    titles = ("", "parameter", *(title for _, title, _ in FIGURES), *(f"s to {t:.0%}" for t in TARGETS))
     names = max(len(shorten(key, KEY_WIDTH)) for key in ("parameter", *parameters))
-    figures = (figure.metadata["width"] for figure in FIGURES)
-    return Columns(titles, (max(map(len, labels), default=0), names, *figures, *(9 for _ in TARGETS)), "<<>")
+    widths = (max(map(len, labels), default=0), names, *(width for *_, width in FIGURES), *(9 for _ in TARGETS))
+    return Columns(titles, widths, "<<>")
 
 
 def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[str, ...]:
@@ -182,7 +190,7 @@ def method_cells(record: MethodRecord, parameter: str | None = None) -> tuple[st
     named = (record.method.label, shorten(parameter or record.parameter, KEY_WIDTH))
     if record.relative_rmse is None:
         return *named, record.message if record.status is BenchStatus.OK else record.status.value
-    figures = (_figure(record, figure.name) for figure in FIGURES)
+    figures = (_figure(record, name) for name, *_ in FIGURES)
     return *named, *figures, *(_seconds(record, f"{target:g}") for target in TARGETS)
 
 

@@ -26,9 +26,9 @@ SMALL = [
     for argument in ("--set", setting)
 ]
 KEY = "white.reflectance.data"
-KEYS = ["case", "parameter", "integrator", "estimator", "reference", "kind", "seeds", "verdict", "relative_l2",
+KEYS = ["case", "parameter", "label", "options", "reference", "kind", "seeds", "verdict", "relative_l2",
         "relative_l2_limit", "z_rms", "z_rms_limit", "z_max", "z_max_limit", "cosine", "variance_ratio", "detectable",
-        "message", "paths", "light_share", "holds"]  # fmt: skip
+        "message", "holds"]  # fmt: skip
 
 
 call = partial(ended, "gradcheck")
@@ -41,12 +41,12 @@ def test_a_table_and_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert call(*SMALL, "--seeds", "8", "--integrators", both, "--json", str(json_file)) == 0
     rows = measured(json_file)
     assert [list(row) for row in rows] == [KEYS] * 11
-    assert [(row["parameter"], row["estimator"], row["reference"], row["kind"]) for row in rows] == [
-        (None, None, "ptracer", "image"),
+    assert [(row["parameter"], row["label"], row["reference"], row["kind"]) for row in rows] == [
+        (None, "reslrb", "ptracer", "image"),
         *(
-            (KEY, *pair, "equal_seeds" if pair == ("stack", "walk_ad") else "expectation")
+            (KEY, *pair, "equal_seeds" if pair == ("reslrb:stack", "walk_ad") else "expectation")
             for group in (("finite_difference", "forward_mode", "unguided"), ("walk_ad", "ptracer"))
-            for pair in itertools.product(("stack", "event(capacity=2)"), group)
+            for pair in itertools.product(both.split(","), group)
         ),
     ]
     assert all(row["holds"] is True and row["seeds"] == 8 for row in rows)
@@ -67,7 +67,7 @@ def test_failures_are_named(
     assert call(*SMALL, "--seeds", "8", "--integrators", "reslrb:stack,reslrb:gather", "--json", str(json_file)) == 1
     rows = measured(json_file)
     assert all(list(row) == KEYS for row in rows)
-    assert {row["estimator"] for row in rows if row["holds"] is False} == {"stack"}
+    assert {row["label"] for row in rows if row["holds"] is False} == {"reslrb:stack"}
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILS: ")]
     assert len(lines) == 4
     where = "FAILS: the built-in Cornell box: white.reflectance.data: reslrb:stack against walk_ad, equal seeds: "
@@ -108,7 +108,7 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     words = ["--integrators", "reslrb:stack", "--json", str(json_file)]
     assert call("--suite", "extreme:furnace", *words) == 0
     rows = measured(json_file)
-    assert {(row["case"], row["estimator"], row["holds"]) for row in rows} == {("furnace", "stack", True)}
+    assert {(row["case"], row["label"], row["holds"]) for row in rows} == {("furnace", "reslrb:stack", True)}
     assert "analytic" in {row["reference"] for row in rows}
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].startswith("furnace ")
@@ -121,7 +121,7 @@ def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_a_stopped_suite_keeps_finished_cases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from reslrb_cli.measure import extreme
 
-    row = {"parameter": None, "integrator": "reslrb", "estimator": "stack", "reference": Reference.ANALYTIC,
+    row = {"parameter": None, "label": "reslrb:stack", "options": {}, "reference": Reference.ANALYTIC,
            "kind": Kind.EXPECTATION, "seeds": 3, "verdict": Verdict.HOLDS}  # fmt: skip
 
     def pretended(name: str, *_others: object) -> Iterator[GradcheckRecord]:
@@ -141,7 +141,7 @@ def test_a_suite_names_its_open_cases(monkeypatch: pytest.MonkeyPatch, capsys: p
     from reslrb_cli.measure import extreme
 
     def pretended(name: str, *_others: object) -> Iterator[GradcheckRecord]:
-        row = {"case": name, "parameter": "a.value", "integrator": "reslrb", "estimator": "stack", "seeds": 8}
+        row = {"case": name, "parameter": "a.value", "label": "reslrb:stack", "options": {}, "seeds": 8}
         row |= {"reference": Reference.PRB, "kind": Kind.EXPECTATION}
         yield GradcheckRecord(**row, verdict=Verdict.HOLDS)
         if name != "held":

@@ -12,11 +12,11 @@ from measure.pretended_steps import Pretended
 from reslrb_cli.config.loader import loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import engine
-from reslrb_cli.measure.bench import MAX_ROUNDS, Bench, BenchResult
-from reslrb_cli.measure.engine import MIN_ROUNDS, NO_TIME, Pace
-from reslrb_cli.measure.methods import Sweep, depths, parse_cases, sample_counts
+from reslrb_cli.measure.bench import Bench
+from reslrb_cli.measure.engine import NO_TIME
+from reslrb_cli.measure.methods import BENCH_ROUNDS, Plan, bench_plan, depths, parse_cases, sample_counts
 from reslrb_cli.measure.processes import CannotStart, Stopped
-from reslrb_cli.records.measurements import BenchStatus, Spread
+from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
 
 # The order of a sweep, and the handling of cases that end. The processes only pretend to measure.
@@ -36,57 +36,50 @@ def _clean() -> None:
     Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
 
 
-def sweep(list_of: str = LIST, **changes: Any) -> Sweep:
-    cases = parse_cases(list_of)
+def sweep(list_of: str = LIST, **changes: Any) -> Plan:
     values: dict[str, Any] = {
-        "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": cases,
-        "values": [2, 4], "memory_limit": None,
-        "budget_s": 0.0, "rounds": MIN_ROUNDS,
+        "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(list_of),
+        "swept": "depth", "values": [2, 4], "memory_limit": None, "budget_s": 0.0, "rounds": 3,
     }  # fmt: skip
-    return Sweep(**(values | changes))
+    return Plan(**(values | changes))
 
 
 def play(
-    what: Sweep, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
-) -> tuple[list[BenchResult], list[str]]:
+    what: Plan, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
+) -> tuple[list[BenchRecord], list[str]]:
     said: list[str] = []
     rows = [row for depth in Bench(what, stop, said.append, start=kind, **options).run() for row in depth]
     assert Pretended.alive == 0
     return rows, said
 
 
-def run(what: Sweep, stop: Callable[[], bool] = lambda: False) -> list[BenchResult]:
+def run(what: Plan, stop: Callable[[], bool] = lambda: False) -> list[BenchRecord]:
     return play(what, stop=stop)[0]
 
 
 def test_steps_are_interleaved_in_rotating_order() -> None:
     run(sweep(values=[2]))
     types = ["ptracer", "reslrb", "walk_ad"]
-    # One cold step, then two until no kernel is new. All but the cold one refill caches first.
-    warm = [(2, name, numbers) for name in types for numbers in ([0], [0, 0], [0, 0])]
-    rounds = [(2, types[(r + k) % 3], [r, r]) for r in range(MIN_ROUNDS) for k in range(3)]
+    # One cold step, then two until no kernel is new. The first step of a turn refills caches.
+    warm = [(2, name, [0]) for name in types for _ in range(3)]
+    rounds = [(2, types[(r + k) % 3], [2 * r, 2 * r + 1]) for r in range(3) for k in range(3)]
     assert Pretended.log == warm + rounds
 
 
 def test_records() -> None:
     rows = run(sweep())
-    assert [(row.record.integrator, row.record.max_depth) for row in rows] == [
-        (name, depth) for depth in (2, 4) for name in ("ptracer", "reslrb", "walk_ad")
+    assert [(row.method.label, row.method.max_depth) for row in rows] == [
+        (name, depth) for depth in (2, 4) for name in LIST.split(",")
     ]
-    stack = rows[1].record
-    assert (stack.estimator, stack.capacity, stack.rr_depth, stack.spp) == ("stack", None, 7, 4)
-    assert (stack.width, stack.height, stack.texels, stack.status, stack.repeats) == (
-        6,
-        5,
-        9,
-        BenchStatus.OK,
-        MIN_ROUNDS,
-    )
-    assert stack.step_ms == Spread(12.0, 8.0, 16.0)
-    assert stack.kernel_ms == Spread(6.0, 4.0, 8.0)
-    assert (stack.codegen_ms, stack.tracing_ms) == (Spread(1.5, 1.0, 2.0), Spread(4.5, 3.0, 6.0))
+    stack = rows[1]
+    options = [stack.method.options[name] for name in ("type", "estimator", "rr_depth")]
+    assert (options, stack.method.spp) == (["reslrb", "stack", 7], 4)
+    assert (stack.width, stack.height, stack.texels, stack.status, stack.repeats) == (6, 5, 9, BenchStatus.OK, 3)
+    assert stack.step_ms == Spread(20.0, 12.0, 28.0)
+    assert stack.kernel_ms == Spread(10.0, 6.0, 14.0)
+    assert (stack.codegen_ms, stack.tracing_ms) == (Spread(2.5, 1.5, 3.5), Spread(7.5, 4.5, 10.5))
     assert (stack.cold_ms, stack.peak_mib, stack.scratch_bytes) == (4.0, 1.5, 60)
-    assert rows[1].step_ratio == rows[1].kernel_ratio == Spread(0.5, 0.5, 0.5)  # taken in pairs, because all slow down
+    assert stack.step_ratio == stack.kernel_ratio == Spread(0.5, 0.5, 0.5)  # taken in pairs, because all slow down
     assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
 
 
@@ -94,13 +87,13 @@ def test_records() -> None:
 def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None:
     Pretended.ends = {("walk_ad", 2): question}
     rows = run(sweep())
-    ended = rows[2].record
+    ended = rows[2]
     assert (ended.status, ended.repeats, ended.width) == (BenchStatus.OUT_OF_MEMORY, 0, 6)
     measured = (ended.step_ms, ended.kernel_ms, ended.cold_ms, ended.peak_mib, ended.scratch_bytes)
     assert measured == (None,) * 5
-    assert (rows[2].reason, rows[2].step_ratio) == ("ended by SIGSEGV", None)
-    assert [row.record.repeats for row in rows] == [3, 3, 0, 3, 3, 3]
-    assert rows[5].record.status is BenchStatus.OK  # the case is tried again at the next depth
+    assert (ended.message, ended.step_ratio) == ("ended by SIGSEGV", None)
+    assert [row.repeats for row in rows] == [3, 3, 0, 3, 3, 3]
+    assert rows[5].status is BenchStatus.OK  # the case is tried again at the next depth
 
 
 def test_without_a_baseline_there_are_no_ratios() -> None:
@@ -117,7 +110,7 @@ def test_times_are_relative_to_ptracer_or_the_first_case(cases: str) -> None:
 @pytest.mark.parametrize(("question", "width"), [(0, None), (1, 6)], ids=["loading", "cold"])
 def test_all_cases_may_end(question: int, width: int | None) -> None:
     Pretended.ends = {(name, 2): question for name in ("ptracer", "reslrb", "walk_ad")}
-    found = {(row.record.status, row.record.width) for row in run(sweep(values=[2]))}
+    found = {(row.status, row.width) for row in run(sweep(values=[2]))}
     assert found == {(BenchStatus.OUT_OF_MEMORY, width)}
 
 
@@ -125,8 +118,8 @@ def test_all_cases_may_end(question: int, width: int | None) -> None:
 def test_a_stop_keeps_finished_measurements(after: int, kept: list[int]) -> None:
     answers = iter(range(1000))
     rows = run(sweep(), stop=lambda: next(answers) > after)
-    assert [row.record.repeats for row in rows] == kept
-    assert all(row.record.status is BenchStatus.OK for row in rows)
+    assert [row.repeats for row in rows] == kept
+    assert all(row.status is BenchStatus.OK for row in rows)
 
 
 def test_cases_that_need_shared_memory_release_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,46 +136,15 @@ def test_cases_that_need_shared_memory_release_it(monkeypatch: pytest.MonkeyPatc
         assert asked[-1] == (mib == 5)
 
 
-def test_pace_divides_the_budget() -> None:
-    now = [0.0]
-    pace, spent = (
-        Pace(seconds, depths, None, MAX_ROUNDS, lambda: now[0]) for seconds, depths in ((100.0, 3), (200.0, 2))
-    )
-
-    def rounds(begin_s: float, round_s: float, pace: Pace = pace) -> int:
-        pace.begin_depth()
-        now[0] += begin_s
-        pace.begin_rounds()
-        done = 0
-        while pace.another(done, done):
-            now[0] += round_s
-            done += 1
-        return done
-
-    # The shares of 100 s are 1, 1.3 and 1.69, so the first depth gets 25.1 s. The second depth gets 33.5 s of the
-    # remaining 77 s. The third depth gets the rest.
-    assert rounds(2.0, 3.0) == 7
-    assert rounds(3.0, 4.0) == 7
-    assert rounds(1.0, 5.0) == 9
-    assert 95.0 < now[0] <= 100.0
-    assert rounds(1.0, 30.0, spent) == MIN_ROUNDS
-    assert (
-        rounds(1.0, 50.0, Pace(100.0, 1, None, MAX_ROUNDS, lambda: now[0])) == 1
-    )  # a second round would exceed the whole budget
-    assert rounds(1.0, 50.0, Pace(0.0, 1, 7, MAX_ROUNDS, lambda: now[0])) == 7
-    cheap = Pace(1e6, 1, None, MAX_ROUNDS, lambda: 0.0)
-    cheap.begin_depth()
-    assert [cheap.another(done, done) for done in (MAX_ROUNDS - 1, MAX_ROUNDS)] == [True, False]
+def test_without_rounds_and_with_time_there_is_a_fixed_number_of_rounds() -> None:
+    assert [row.repeats for row in run(sweep(rounds=None, budget_s=1e6))] == [BENCH_ROUNDS] * 6
 
 
 @pytest.mark.parametrize(
     ("budget_s", "measured", "left"),
     [
         (1000.0, {2: LIST.split(","), 4: LIST.split(",")}, []),
-        # At the second depth, only the first case has compiled when time is up. Compiled cases are measured all the
-        # same.
-        (130.0, {2: LIST.split(","), 4: ["ptracer"]}, ["depth 4, reslrb:stack, walk_ad"]),
-        (85.0, {2: LIST.split(",")[:2]}, ["depth 2, walk_ad", "depth 4"]),
+        (130.0, {2: LIST.split(",")}, ["depth 4, ptracer, reslrb:stack, walk_ad"]),
         (10.0, {}, ["depth 2, ptracer, reslrb:stack, walk_ad", "depth 4"]),
     ],
 )
@@ -211,8 +173,8 @@ def spent(budget_s: float) -> tuple[dict[int, list[str]], list[str], float]:
     rows, said = play(sweep(rounds=None, budget_s=budget_s), Slow, now=lambda: now[0])
     found: dict[int, list[str]] = {}
     for row in rows:
-        found.setdefault(row.record.max_depth, []).append(row.case.label)
-        assert row.record.status is BenchStatus.OK
+        found.setdefault(row.method.max_depth, []).append(row.method.label)
+        assert row.status is BenchStatus.OK
     assert Pretended.alive == 0
     return found, said, now[0]
 
@@ -236,7 +198,6 @@ def test_depths() -> None:
 def test_options_of_cases() -> None:
     cases = parse_cases("reslrb:reservoir(capacity=4, weight=adjoint), ptracer(rr_depth=3),prb,reslrb")
     config = loads(CONFIG, "x.yaml")
-    assert [case.estimator for case in cases] == ["reservoir(weight=adjoint)", None, None, "reservoir"]
     options = [case.at(config, 9, known=True).integrator.options() for case in cases]
     assert (options[0]["capacity"], options[0]["samples_per_pass"], options[0]["max_depth"]) == (4, 2, 9)
     assert [option["rr_depth"] for option in options] == [7, 3, 7, 7]
@@ -249,9 +210,7 @@ def test_cases_may_have_their_own_adjoint() -> None:
     runs = [c.at(config, 9, known=False).run for c in (case, other, third)]
     assert [run.adjoint for run in runs] == ["batched", "correlated", "batched"]
     assert [run.batches for run in runs] == [2, 4, 4]
-    assert case.estimator == "stack(adjoint=batched,batches=2)"
-    guided, plain = parse_cases("reslrb:stack(guiding=on),reslrb:stack(guiding=off)")
-    assert (guided.estimator, plain.estimator) == ("stack(guiding=on)", "stack")
+    [guided] = parse_cases("reslrb:stack(guiding=on)")
     assert guided.at(config, 4, known=True).integrator.options()["guiding"] == "on"
     assert case.at(loads(CONFIG, "x.yaml"), 9, known=False).run.batches == 2
 
@@ -272,7 +231,7 @@ def test_cases_may_have_their_own_adjoint() -> None:
 )
 def test_wrong_lists_are_located(text: str, line: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        sweep(text).check()
+        bench_plan(loads(CONFIG, "x.yaml"), "depth", [2], text, 2, budget_s=1.0)
     assert str(caught.value).startswith("--integrators")
     assert line in str(caught.value)
 
@@ -280,8 +239,8 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
 def test_unnamed_cases_that_refuse_are_left_out():
     Pretended.refusing = {"reslrb"}
     results, lines = play(sweep(default=True))
-    assert {result.record.integrator for result in results} == {"ptracer", "walk_ad"}
-    assert {result.record.max_depth for result in results} == set(sweep().values)
+    assert {result.method.label for result in results} == {"ptracer", "walk_ad"}
+    assert {result.method.max_depth for result in results} == set(sweep().values)
     assert lines == ["left out: reslrb:stack: no derivatives of moving light"]
 
 
@@ -296,19 +255,15 @@ def test_named_cases_and_baselines_are_not_left_out(refusing: str, default: bool
 # Sweeps of sample counts.
 
 
-def run_swept(values: list[int], rounds: int | None = 3) -> tuple[list[BenchResult], list[str]]:
+def run_swept(values: list[int], rounds: int | None = 3) -> tuple[list[BenchRecord], list[str]]:
     config = loads(CONFIG, Path("x.yaml"), ["integrator.max_depth=5"])
-    what = sweep(config=config, values=values, rounds=rounds, swept="spp")
-    what.check()
-    return play(what)
+    return play(sweep(config=config, values=values, rounds=rounds, swept="spp"))
 
 
 def test_the_sample_count_varies_and_the_depth_stays() -> None:
     rows, said = run_swept([2, 8])
     assert said == []
-    assert [row.value for row in rows] == [2] * 3 + [8] * 3
-    records = [row.record for row in rows if row.case.type == "walk_ad"]
-    assert [(record.spp, record.max_depth, record.width) for record in records] == [(2, 5, 6), (8, 5, 6)]
+    assert [(row.method.spp, row.method.max_depth, row.width) for row in rows] == [(2, 5, 6)] * 3 + [(8, 5, 6)] * 3
 
 
 def test_the_table_starts_with_the_varied_quantity() -> None:
@@ -317,10 +272,10 @@ def test_the_table_starts_with_the_varied_quantity() -> None:
     labels = LIST.split(",")
     table = bench_columns(labels, "spp")
     assert table.head().split()[:2] == ["spp", "step"]
-    lines = [table.line(bench_cells(row)) for row in rows]
+    lines = [table.line(bench_cells(row, row.method.spp)) for row in rows]
     assert [line.split()[:2] for line in lines] == [[str(spp), name] for spp in (16, 128) for name in labels]
     assert lines[2].endswith("out_of_memory")
-    assert {row.record.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
+    assert {row.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
 
 
 def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:
@@ -331,7 +286,7 @@ def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:
 
 def test_impossible_sample_counts_are_located() -> None:
     with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
-        run_swept([4, 3])
+        bench_plan(loads(CONFIG, "x.yaml"), "spp", [4, 3], LIST, 2, budget_s=1.0)
 
 
 def test_default_values() -> None:
@@ -342,5 +297,5 @@ def test_default_values() -> None:
 def test_results_grow_with_each_round() -> None:
     """The command writes its file after each round, so that a killed process loses only its last round."""
     made = Bench(sweep(values=[2]), lambda: False, lambda line: None, start=Pretended)
-    seen = [[result.record.repeats for result in made.results()] for _ in made.run()]
+    seen = [[result.repeats for result in made.results()] for _ in made.run()]
     assert seen == [[1] * 3, [2] * 3, [3] * 3, [3] * 3]

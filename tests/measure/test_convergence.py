@@ -17,7 +17,6 @@ from turns import a_few
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure import steps
-from reslrb_cli.measure.engine import Role
 from reslrb_cli.measure.judgement import HEAVY, Judgement, MethodSamples, ReferenceMean
 from reslrb_cli.measure.methods import DEFAULTS, IMAGES, parse_cases
 from reslrb_cli.measure.steps import Sampler, survey
@@ -84,7 +83,7 @@ def test_too_heavy_tails_for_intervals_are_reported() -> None:
         assert "dominate the variance" in flagged.message, key
         assert flagged.biased is None  # heavy tails also make z scores unreliable
         assert (sound.message, sound.biased) == ("", False)
-    [member] = [member for member in session.of(Role.CASE) if member.request.label == "reslrb:stack"]
+    [member] = [member for member in session.of("case") if member.label == "reslrb:stack"]
     assert Judgement(session).overall(member).message == HEAVY  # also in the lines printed during the measurement
     lucky = play(Stage(case_reslrb_stack=Pretence(0.1, 0.1)), plan())[1]
     assert of(lucky, "reslrb:stack").efficiency.low > 10 * of(results, "reslrb:stack").efficiency.value
@@ -144,20 +143,20 @@ def test_the_noise_of_one_image_is_not_a_bias() -> None:
                   case_reslrb_stack_adjoint_batched_=Pretence(0.1, 0.05),
                   case_reslrb_stack_adjoint_correlated_=Pretence(0.1, 0.05, bias=0.5))  # fmt: skip
     cases = "reslrb:stack(adjoint=batched),reslrb:stack(adjoint=correlated)"
-    session, results, _ = play(stage, plan(cases, objective="loss", rounds=32))
-    assert [m.request.method.adjoint for m in session.members] == ["batched", "correlated", None, None]
+    session, results, _ = play(stage, plan(cases, quantity="loss", rounds=32))
+    assert [m.method.adjoint for m in session.members] == ["batched", "correlated", None, None]
     assert [r.biased for r in results.methods if r.parameter == "all"] == [False, True]
     reference = next(r for r in results.references if r.parameter == "all")
     assert reference.reference_rmse == pytest.approx(0.05 / np.sqrt(8), rel=0.3)
-    assert of(results, "reslrb:stack(adjoint=batched)").method.estimator == "stack"
+    assert of(results, "reslrb:stack(adjoint=batched)").method.options["estimator"] == "stack"
 
 
 def test_a_sweep_of_samples() -> None:
     """Each sample count is a separate method. The reference has the sample count of the configuration."""
     four, sixteen = Pretence(0.1, 1.0), Pretence(0.3, 0.5)
     stage = Stage(case_reslrb_stack__4_spp=four, case_reslrb_stack__16_spp=sixteen)
-    session, results, _ = play(stage, plan("reslrb:stack", spps=(4, 16)))
-    assert [(m.request.label, m.request.spp, m.request.config.run.spp) for m in session.members] == [
+    session, results, _ = play(stage, plan("reslrb:stack", values=(4, 16)))
+    assert [(m.label, m.spp, m.config.run.spp) for m in session.members] == [
         ("reslrb:stack, 4 spp", 4, 4), ("reslrb:stack, 16 spp", 16, 16), ("reslrb:stack", 4, 4), ("ptracer", 4, 4)
     ]  # fmt: skip
     assert of(results, "reslrb:stack, 16 spp").relative_rmse == pytest.approx(0.5, rel=0.1)
@@ -176,7 +175,7 @@ LEAST, MOST = (int(stats.binom.ppf(p, REPETITIONS, 0.95)) for p in (0.0005, 0.99
 TRUTH = np.random.default_rng(2).uniform(0.5, 2.0, 40)
 SIGNAL = float(TRUTH @ TRUTH)
 SECONDS = 0.2
-METHOD = Method("ptracer", "ptracer", None, None, None, 4)
+METHOD = Method("ptracer", {"type": "ptracer"}, 4)
 
 
 def noise(random: np.random.Generator, count: int) -> np.ndarray:
@@ -254,11 +253,10 @@ def test_the_floor_and_the_signal() -> None:
 
 def test_omissions_of_a_reference() -> None:
     reference = make(1, rows=5).reference
-    moved, noises, signals = reference.without
-    for k in range(5):
-        rest = ReferenceMean(np.delete(reference.rows, k, axis=0))
-        np.testing.assert_allclose(reference.mean + moved[k], rest.mean)
-        assert (noises[k], signals[k]) == pytest.approx((rest.noise, rest.signal))
+    for k in range(-1, 5):
+        rest = ReferenceMean(np.delete(reference.rows, k, axis=0)) if k >= 0 else reference
+        np.testing.assert_allclose(reference.mean + reference.moved[1 + k], rest.mean)
+        assert (reference.noises[1 + k], reference.signals[1 + k]) == pytest.approx((rest.noise, rest.signal))
 
 
 @pytest.mark.parametrize(("steps", "rows"), [(48, 24), (16, 8), (192, 48)])
@@ -329,7 +327,7 @@ def test_equal_methods_seldom_have_a_best() -> None:
             estimate = MethodSamples(values, np.arange(32) // 2, seconds, reference).efficiency()
             assert estimate is not None
             records.append(MethodRecord(
-                replace(METHOD, label=str(number)), KEY, BenchStatus.OK, biased=False,
+                method=replace(METHOD, label=str(number)), parameter=KEY, status=BenchStatus.OK, biased=False,
                 efficiency=estimate.exponential(), efficiency_freedom=estimate.freedom,
             ))  # fmt: skip
         claimed += "times as efficient" in closing_sentence(records)
@@ -386,7 +384,7 @@ def test_figures_of_the_table_are_fields_of_the_record() -> None:
     figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)", "s to 10%", "s to 3%", "s to 1%")
     assert method_columns([], []).titles == ("", "parameter", *figures)
     record = MethodRecord(
-        METHOD, "a", BenchStatus.OK, step_s=0.5, repeats=12000, relative_rmse=0.1, slope=-0.5,
+        method=METHOD, parameter="a", status=BenchStatus.OK, step_s=0.5, repeats=12000, relative_rmse=0.1, slope=-0.5,
         efficiency=Range(2, 1, 3), bias_z=1.5, bias_z_limit=4.5,
     )  # fmt: skip
     assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2.0 [1.0, 3.0]", "1.5 (4.5) open")

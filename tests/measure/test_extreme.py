@@ -59,7 +59,7 @@ def counted(monkeypatch: pytest.MonkeyPatch, name: str, estimators: Iterable[str
 @pytest.mark.parametrize(("name", "estimator"), [(name, "stack") for name in FEW])
 def test_case(monkeypatch: pytest.MonkeyPatch, name: str, estimator: str):
     records = counted(monkeypatch, name, [estimator])
-    assert {record.estimator for record in records} == {estimator}
+    assert {record.label for record in records} == {f"reslrb:{estimator}"}
 
 
 def test_images_with_heavy_tails_are_open_only_for_a_reason():
@@ -124,7 +124,7 @@ def test_differences_along_random_directions_and_amplitudes(name: str, monkeypat
 )
 def test_camera_paths_are_left_out_of_light_that_they_cannot_find(name: str, reason: str):
     [record] = run_case(CASES[name], ["stack(paths=camera)"])
-    assert (record.verdict, record.paths, record.light_share) == (Verdict.NO_REFERENCE, "camera", None)
+    assert (record.verdict, record.options) == (Verdict.NO_REFERENCE, {"paths": "camera"})
     assert reason in record.message
 
 
@@ -135,7 +135,7 @@ def test_along_the_border_camera_paths_are_compared_with_a_complete_reference():
     """
     records = list(run_case(CASES["film_crop"], WAYS[:1]))
     assert {record.reference.value for record in records} == {"walk_ad", "prb", "path"}
-    assert {record.paths for record in records} == {"both"}
+    assert {record.options["paths"] for record in records} == {"both"}
     assert all(record.holds for record in records)
 
 
@@ -157,7 +157,7 @@ def lost(case: str, estimator: str) -> list[str]:
 def test_selection_by_contribution_loses_later_vertices_of_a_heavy_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("reslrb_cli.estimators.selection.SHARE", 0.0)
     records = run_case(CASES["connection_1e8"], ["reservoir", "event"])
-    assert {record.estimator for record in records if record.holds is False} == {"reservoir", "event"}
+    assert {record.label for record in records if record.holds is False} == {"reslrb:reservoir", "reslrb:event"}
 
 
 @pytest.mark.long

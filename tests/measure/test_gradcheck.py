@@ -77,7 +77,11 @@ def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", see
 
 
 def failures(records: list[GradcheckRecord]) -> set[tuple[str | None, str]]:
-    return {(one.estimator, one.reference.value) for one in records if one.verdict is not Verdict.HOLDS}
+    return {
+        (one.label.partition(":")[2] or None, one.reference.value)
+        for one in records
+        if one.verdict is not Verdict.HOLDS
+    }
 
 
 @pytest.mark.long  # tests of faults show that it holds without them
@@ -86,7 +90,7 @@ def test_it_holds():
     assert failures(records) == set()
     assert [record.kind for record in records].count(Kind.IMAGE) == 1
     for name in ("reservoir", "event", "gather", "stack"):
-        of = {record.reference: record for record in records if record.estimator == name}
+        of = {record.reference: record for record in records if record.label == f"reslrb:{name}"}
         assert list(of) == [Reference.FINITE_DIFFERENCE, Reference.FORWARD_MODE, Reference.WALK_AD, Reference.PTRACER]
         exact = name in ("gather", "stack")
         assert (of[Reference.WALK_AD].kind is Kind.EQUAL_SEEDS) is exact
@@ -417,20 +421,17 @@ def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
     records = check("scene.options.size=8", estimators=WAYS, seeds=4)
     assert not [record for record in records if record.holds is False]
     alike = [record for record in records if record.kind is Kind.EQUAL_SEEDS]
-    assert [(r.paths, r.light_share, r.holds) for r in alike] == [
-        ("light", None, True), ("both", 0.25, True)
+    both = {"paths": "both", "light_share": 0.25}
+    assert [(r.options, r.holds) for r in alike] == [({}, True), (both, True)]
+    assert [(r.options, r.reference) for r in records if r.kind is Kind.IMAGE] == [
+        ({}, Reference.PTRACER), (both, Reference.PATH)
     ]  # fmt: skip
-    assert [(r.paths, r.reference) for r in records if r.kind is Kind.IMAGE] == [
-        ("light", Reference.PTRACER), ("both", Reference.PATH)
-    ]  # fmt: skip
-    assert {r.paths for r in records if r.reference is Reference.PRB} == {"both"}
+    assert [r.options for r in records if r.reference is Reference.PRB] == [both]
     entry = json.loads(alike[1].to_json())
-    assert (entry["estimator"], entry["paths"]) == ("stack(paths=both,light_share=0.25)", "both")
+    assert entry["label"] == "reslrb:stack(paths=both,light_share=0.25)"
     assert record_of(GradcheckRecord, entry) == alike[1]
-    old = {name: value for name, value in entry.items() if name not in ("paths", "light_share")}
-    found = record_of(GradcheckRecord, old)
-    assert found is not None
-    assert (found.paths, found.light_share) == ("light", None)
+    old = {name: value for name, value in entry.items() if name not in ("label", "options")}
+    assert record_of(GradcheckRecord, old | {"integrator": "reslrb", "estimator": "stack"}).label == "reslrb:stack"
 
 
 def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch):

@@ -52,4 +52,4 @@ def as_it_stands(check: str) -> set[tuple[str | None, str]]:
 
 def failures(records: Iterable[GradcheckRecord]) -> set[tuple[str | None, str]]:
     """Return the estimator and the reference of each failing record."""
-    return {(r.estimator, r.reference.value) for r in records if r.verdict is Verdict.FAILS}
+    return {(r.label.partition(":")[2] or None, r.reference.value) for r in records if r.verdict is Verdict.FAILS}

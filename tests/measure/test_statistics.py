@@ -375,7 +375,7 @@ def test_a_rarely_hit_texture_is_compared_in_larger_tiles():
 
 
 def record(**changes) -> GradcheckRecord:
-    values = {"case": "a.yaml", "parameter": "floor.data", "integrator": "reslrb", "estimator": "stack",
+    values = {"case": "a.yaml", "parameter": "floor.data", "label": "reslrb:stack", "options": {},
               "reference": Reference.PTRACER, "kind": Kind.EXPECTATION, "seeds": 16, "verdict": Verdict.FAILS,
               "relative_l2": 0.0312, "z_rms": 3.2, "z_rms_limit": 1.5, "z_max": 9.1, "z_max_limit": 5.2,
               "detectable": 0.02}  # fmt: skip
@@ -385,7 +385,7 @@ def record(**changes) -> GradcheckRecord:
 def test_a_record_survives_a_round_trip() -> None:
     found = record(verdict=Verdict.UNRESOLVED, parameter=None)
     line = json.loads(found.to_json())
-    assert {"case", "parameter", "integrator", "estimator", "reference", "seeds", "relative_l2", "z_rms", "z_max",
+    assert {"case", "parameter", "label", "options", "reference", "seeds", "relative_l2", "z_rms", "z_max",
             "cosine", "variance_ratio", "holds"} <= set(line)  # fmt: skip
     assert (line["reference"], line["verdict"], line["holds"]) == ("ptracer", "unresolved", None)
     assert json.loads(record(relative_l2=float("inf")).to_json())["relative_l2"] is None

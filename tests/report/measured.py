@@ -17,6 +17,7 @@ from reslrb_cli.records.measurements import (
     BenchStatus,
     GradcheckRecord,
     Kind,
+    Method,
     MissingRecord,
     Reference,
     Spread,
@@ -36,13 +37,13 @@ def write_bench(path, depths=(2, 4, 8)):
     """Write a bench of two integrators. `ptracer` runs out of memory at the last depth."""
     records = []
     for depth in depths:
-        for integrator, estimator, factor in (("ptracer", None, 3.0), ("reslrb", "reservoir", 1.0)):
-            ended = estimator is None and depth == depths[-1]
+        for label, factor in (("ptracer", 3.0), ("reslrb:reservoir", 1.0)):
+            ended = label == "ptracer" and depth == depths[-1]
             times = None if ended else Spread(factor * depth, 0.9 * factor * depth, 1.2 * factor * depth)
             status = BenchStatus.OUT_OF_MEMORY if ended else BenchStatus.OK
             cold = None if ended else 900.0
-            records.append(BenchRecord(integrator, estimator, None, depth, 99, 4, 64, 48, status, times, times, times,
-                                       times, cold, cold, cold, 0, 5))  # fmt: skip
+            method = Method(label, {"rr_depth": 99}, 4, depth)
+            records.append(BenchRecord(method, status, 64, 48, None, *[times] * 4, None, None, cold, cold, cold, 0, 5))
     write_records(path, records)
 
 
@@ -50,9 +51,9 @@ def write_gradcheck(path, parameter="floor.reflectance.data"):
     """Write a comparison that holds, one that fails, and the missing part of a derivative."""
     common = {"kind": Kind.EXPECTATION, "seeds": 8, "relative_l2": 0.02, "z_rms": 1.1, "z_rms_limit": 1.4}
     records = [
-        GradcheckRecord("box.yaml", parameter, "reslrb", estimator, Reference.PTRACER, verdict=verdict, z_max=z,
+        GradcheckRecord("box.yaml", parameter, label, {}, Reference.PTRACER, verdict=verdict, z_max=z,
                         z_max_limit=4.0, **common)
-        for estimator, verdict, z in (("stack", Verdict.HOLDS, 2.0), ("gather", Verdict.FAILS, 9.0))
+        for label, verdict, z in (("reslrb:stack", Verdict.HOLDS, 2.0), ("reslrb:gather", Verdict.FAILS, 9.0))
     ]  # fmt: skip
     write_records(path, [*records, MissingRecord("box.yaml", parameter, 0.25, 0.01, 3, 16)])
 
@@ -66,10 +67,8 @@ def convergence_lines(parameter="all"):
     extrapolated, and one error is never reached.
     """
     lines = []
-    for integrator, estimator, factor in (("ptracer", None, 0.5), ("reslrb", "stack", 0.2)):
-        label = integrator if estimator is None else f"{integrator}:{estimator}"
-        method = {"label": label, "integrator": integrator, "estimator": estimator, "capacity": None}
-        method |= {"adjoint": "independent", "parameter": parameter, "spp": 4}
+    for label, factor in (("ptracer", 0.5), ("reslrb:stack", 0.2)):
+        method = {"label": label, "options": {}, "adjoint": "independent", "parameter": parameter, "spp": 4}
         for elapsed in (0.5, 1.0, 2.0, 4.0):
             figures = {"elapsed_s": elapsed, "relative_rmse": factor / elapsed**0.5, "reference_rmse": 0.01}
             lines.append({"kind": "point", **method, **figures, "steps": 4, "repeats": 8})

@@ -134,7 +134,12 @@ def test_a_csv_has_plain_numbers(tmp_path):
     row = rows[0]
     assert [float(row[name]) for name in ("efficiency", "efficiency_low", "efficiency_high", "seconds_to_0.03")] == [
         4.0, 3.0, 5.0, 120.0]  # fmt: skip
-    assert (row["seconds_to_0.01"], row["capacity"], row["biased"], row["extrapolated"]) == ("", "", "0", "0.03")
+    assert (row["seconds_to_0.01"], row["adjoint"], row["biased"], row["extrapolated"]) == (
+        "",
+        "independent",
+        "0",
+        "0.03",
+    )
     assert "kind" not in row
 
 
@@ -156,9 +161,14 @@ def test_tables_of_other_measurements(tmp_path):
 
 def test_records_become_arrays_and_figures(tmp_path):
     """The records of a measurement need no file."""
-    method = Method("prb", "prb", None, None, None, 4)
+    method = Method("prb", {}, 4)
     points = [PointRecord(method, "image", n, float(n), 1 / n, 0.01, 8, 0.9 / n, 1.1 / n) for n in (1, 2, 4)]
-    records = [*points, MethodRecord(method, "image", BenchStatus.OK, efficiency=Range(2.0, 1.5, 2.5), biased=True)]
+    records = [
+        *points,
+        MethodRecord(
+            method=method, parameter="image", status=BenchStatus.OK, efficiency=Range(2.0, 1.5, 2.5), biased=True
+        ),
+    ]
     (found,) = zip(*(rl.table(records)[name] for name in ("efficiency_low", "biased", "slope")), strict=True)
     assert found[:2] == (1.5, 1.0)
     assert np.isnan(found[2])
