@@ -102,7 +102,7 @@ def test_examples_are_unchanged_copies(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_an_example_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even a link that leads nowhere."""
+    """A broken link also counts as an existing file."""
     monkeypatch.chdir(tmp_path)
     name, path = next(iter(examples().items()))
     Path("of").mkdir()

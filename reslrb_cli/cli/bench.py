@@ -25,7 +25,7 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.methods import BENCHED, DEEPEST, Plan, bench_plan, plays_roulette
+from reslrb_cli.measure.methods import BENCHED, DEEPEST, MeasurementPlan, bench_plan, plays_roulette
 
 if TYPE_CHECKING:
     from reslrb_cli.records.measurements import BenchRecord
@@ -86,7 +86,7 @@ def command(**given: Any) -> int:
     return exit_code(interrupted, BenchStatus.OK in states, states)
 
 
-def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[list[BenchRecord], bool]:
+def _run(plan: MeasurementPlan, json_file: Path | None, began: float) -> tuple[list[BenchRecord], bool]:
     """Measure, print and write. Return all results, and True if the user interrupted."""
     from reslrb_cli.measure.bench import Bench
     from reslrb_cli.report.tables import bench_cells, bench_columns
@@ -109,7 +109,7 @@ def _run(plan: Plan, json_file: Path | None, began: float) -> tuple[list[BenchRe
         return session.results(), interrupts.requested
 
 
-def _conditions(plan: Plan) -> str:
+def _conditions(plan: MeasurementPlan) -> str:
     """Describe the measurement in one line."""
     config, own = plan.config, plan.config.integrator
     deepest = max(plan.values) if plan.swept == "depth" else own.max_depth

@@ -23,7 +23,7 @@ from reslrb_cli.cli.options import (
 )
 from reslrb_cli.cli.terminal import echo
 from reslrb_cli.config.optimizers import loss_words
-from reslrb_cli.measure.methods import Plan, convergence_plan, plays_roulette
+from reslrb_cli.measure.methods import MeasurementPlan, convergence_plan, plays_roulette
 from reslrb_cli.records.measurements import BenchStatus
 from reslrb_cli.report.format import WITHOUT_BORDER, Columns
 
@@ -91,7 +91,7 @@ def command(**given: Any) -> int:
     return exit_code(interrupted, done, {record.status for record in results.methods})
 
 
-def _run(plan: Plan, options: ConvergenceOptions, began: float) -> tuple[ConvergenceResults, bool]:
+def _run(plan: MeasurementPlan, options: ConvergenceOptions, began: float) -> tuple[ConvergenceResults, bool]:
     """Measure, print and write. Return the results, and True if the user interrupted."""
     from reslrb_cli.measure.convergence import Session
     from reslrb_cli.measure.draws import DrawsFile
@@ -142,7 +142,7 @@ def _table(session: Session) -> Columns:
     return method_columns(labels, [*session.facts.get("shapes", ()), "999 rounds"])
 
 
-def _conditions(plan: Plan, session: Session) -> str:
+def _conditions(plan: MeasurementPlan, session: Session) -> str:
     """Describe the measurement in one line."""
     config, facts = plan.config, session.facts
     depth, rr_depth = config.integrator.max_depth, config.integrator.rr_depth

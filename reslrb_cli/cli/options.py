@@ -29,7 +29,7 @@ from reslrb_cli.records.measurements import BenchStatus
 
 if TYPE_CHECKING:
     from reslrb_cli.measure.engine import Engine
-    from reslrb_cli.measure.methods import Plan
+    from reslrb_cli.measure.methods import MeasurementPlan
 
 
 def origin_of(variant: str) -> Origin:
@@ -82,7 +82,7 @@ E = TypeVar("E", bound="Engine")
 
 @contextmanager
 def measuring(
-    kind: Callable[..., E], plan: Plan, began: float, say: Callable[[str], None] = echo, **options: Any
+    kind: Callable[..., E], plan: MeasurementPlan, began: float, say: Callable[[str], None] = echo, **options: Any
 ) -> Iterator[tuple[E, Interrupts]]:
     """Yield a session that measures `plan`, and the session's `Interrupts`. The session's processes end with it.
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.measure.engine import NO_TIME, Engine, Member
-from reslrb_cli.measure.methods import BENCH_ROUNDS, NamedIntegrator, Plan
+from reslrb_cli.measure.methods import BENCH_ROUNDS, MeasurementPlan, NamedIntegrator
 from reslrb_cli.measure.processes import Stopped
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 
@@ -43,7 +43,7 @@ def bench_record(member: Member, baseline: Member, sizes: Mapping[str, Any]) -> 
 
 
 def _spread(values: np.ndarray) -> Spread | None:
-    """Return the spread of the values that are no NaN, or None if there are none."""
+    """Return the spread of all values except NaN, or None if every value is NaN."""
     known = values[~np.isnan(values)]
     return Spread.of(known.tolist()) if len(known) else None
 
@@ -54,7 +54,9 @@ class Bench(Engine):
     `runs` has the members by value, and `left_out` the cases that do not support the scene.
     """
 
-    def __init__(self, plan: Plan, stop: Callable[[], bool], say: Callable[[str], None], **given: Any) -> None:
+    def __init__(
+        self, plan: MeasurementPlan, stop: Callable[[], bool], say: Callable[[str], None], **given: Any
+    ) -> None:
         super().__init__(plan, stop, say, BENCH_ROUNDS, **given)
         self.runs, self.left_out = dict[int, list[Member]](), list[NamedIntegrator]()
 
@@ -91,9 +93,8 @@ class Bench(Engine):
                 if run.status is BenchStatus.REFUSED:
                     self.say(f"left out: {run.label}: {run.reason}")
                     self.left_out.append(run.case)
-            late = [run.label for run in self.members if run.status is BenchStatus.OK and not run.kept]
-            if late and not stopped:
-                self.say(f"not measured: {plan.name(value)}, {', '.join(late)}: {NO_TIME}")
+            if self.unmeasured and not stopped:
+                self.say(f"not measured: {plan.name(value)}, {', '.join(self.unmeasured)}: {NO_TIME}")
             yield self._results(value)
             if stopped:
                 return

@@ -16,7 +16,7 @@ from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.draws import StoredResults, mixed_sessions, situation
 from reslrb_cli.measure.engine import NO_TIME, Engine, Member, Role
 from reslrb_cli.measure.gradients import places
-from reslrb_cli.measure.methods import ROUNDS, NamedIntegrator, Plan
+from reslrb_cli.measure.methods import ROUNDS, MeasurementPlan, NamedIntegrator
 from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
 from reslrb_cli.records.decisions import key_of
 from reslrb_cli.records.measurements import BenchStatus
@@ -42,7 +42,9 @@ class Session(Engine):
     is measured.
     """
 
-    def __init__(self, plan: Plan, stop: Callable[[], bool], say: Callable[[str], None], **given: Any) -> None:
+    def __init__(
+        self, plan: MeasurementPlan, stop: Callable[[], bool], say: Callable[[str], None], **given: Any
+    ) -> None:
         super().__init__(plan, stop, say, ROUNDS, **given)
         self.rounds = 0
         self.judges: dict[str, Member] = {}
@@ -67,9 +69,8 @@ class Session(Engine):
         if self._survey():
             self._add_members()
             yield from self._take_turns()
-            late = [member.label for member in self.members if member.status is BenchStatus.OK and not member.kept]
-            if late:
-                self.say(f"not measured: {', '.join(late)}: {NO_TIME}")
+            if self.unmeasured:
+                self.say(f"not measured: {', '.join(self.unmeasured)}: {NO_TIME}")
             elif self.is_late() and self.rounds < FEWEST:
                 self.say(f"results need {FEWEST} rounds: {NO_TIME}")
 

@@ -19,7 +19,7 @@ from reslrb_cli.backend.installation import python_command
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.draws import Draws, DrawsFile, StoredResults
-from reslrb_cli.measure.methods import NamedIntegrator, Plan
+from reslrb_cli.measure.methods import MeasurementPlan, NamedIntegrator
 from reslrb_cli.measure.processes import CannotStart, Ended, Process, Stopped
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.measurements import BenchStatus, Method
@@ -39,7 +39,7 @@ Role = Literal["case", "reference", "independent"]
 
 @dataclass(kw_only=True)
 class Member:
-    """A method with its draws so far, which are in `file`, and with its process, or None if no process runs.
+    """A method, its draws so far in `file`, and its process, which is None if it does not run.
 
     - `quantity`, `spp`, `purpose`: as in `steps.Sampler`.
     - `about`: the situation that determines the draws (`DrawsFile`).
@@ -148,7 +148,7 @@ class Engine:
     """
 
     def __init__(
-        self, plan: Plan, stop: Callable[[], bool], say: Callable[[str], None], usual_rounds: int,
+        self, plan: MeasurementPlan, stop: Callable[[], bool], say: Callable[[str], None], usual_rounds: int,
         start: Start = start_process, now: Callable[[], float] = time.monotonic, spent_s: float = 0.0,
         file: DrawsFile | None = None,
     ) -> None:  # fmt: skip
@@ -181,6 +181,11 @@ class Engine:
     def is_late(self) -> bool:
         """Whether the budget is spent."""
         return self._now() >= self._end
+
+    @property
+    def unmeasured(self) -> list[str]:
+        """The labels of the members without draws whose processes did not fail."""
+        return [member.label for member in self.members if member.status is BenchStatus.OK and not member.kept]
 
     def launch(self, config: Config, does: str, **more: Any) -> Any:
         """Return a new process for `config` that runs the function `does` of `steps`. `more` are further entries of its

@@ -28,7 +28,7 @@ from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, R
 #: The suite has fewer cases. Each case gets an equal share of the probability that correct gradients fail anywhere.
 MOST_CASES = 100
 
-#: Label of camera paths, next to the estimators of light paths, as in `--estimators`.
+#: Methods with camera paths, which the suite runs beside the estimators of light paths.
 WAYS = ("stack(paths=both)", "stack(paths=camera)")
 
 #: Radius of a filter, in pixels, that does not reach beyond the film.

@@ -1,5 +1,5 @@
-"""The methods that measurements compare (`NamedIntegrator`), and the plans of `bench` and `convergence` (`Plan`). Does
-not import Mitsuba.
+"""The methods that measurements compare (`NamedIntegrator`), and the plans of `bench` and `convergence`
+(`MeasurementPlan`). Does not import Mitsuba.
 
 A list of methods looks like `ptracer,reslrb:reservoir(capacity=4)`.
 """
@@ -197,6 +197,11 @@ def _split(text: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
+def with_option(label: str, option: str) -> str:
+    """Return the label of a method with a further `option`, such as `paths=both`."""
+    return f"{label.removesuffix(')')}{',' if label.endswith(')') else '('}{option})"
+
+
 def depths(max_depth: int) -> list[int]:
     """Return 2, 4, 8, ... and finally `max_depth`."""
     powers = [2**k for k in range(1, max_depth.bit_length()) if 2**k < max_depth]
@@ -263,7 +268,7 @@ def plays_roulette(depth: int, rr_depth: int) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class MeasurementPlan:
     """The plan of `bench` or `convergence`: each of the `cases` at each of the `values` of the `swept` quantity
     (`depth` or `spp`).
 
@@ -288,7 +293,7 @@ class Plan:
     device: str = ""
 
     @classmethod
-    def of(cls, config: Config, integrators: str | None, usual: str, **others: Any) -> Plan:
+    def of(cls, config: Config, integrators: str | None, usual: str, **others: Any) -> MeasurementPlan:
         """Return a plan from a list of integrators as text, or from the list `usual`. `others` are further fields.
         Raises ConfigError if an integrator of the list, or the reference, is invalid.
 
@@ -331,7 +336,7 @@ class Plan:
             return self.reference
         name = REFERENCES[paths]
         if any(case.options.get("edges") == "on" for case in self.cases):
-            name = f"{name.removesuffix(')')}{',' if ')' in name else '('}edges=on)"
+            name = with_option(name, "edges=on")
         return parse_cases(name, "--reference")[0]
 
     def independent_reference(self, name: str) -> NamedIntegrator:
@@ -354,17 +359,17 @@ class Plan:
 
 def bench_plan(
     config: Config, swept: str, values: Sequence[int], integrators: str | None, max_depth: int, **others: Any
-) -> Plan:
+) -> MeasurementPlan:
     """Return the plan of `bench`. Without `values`, the plan has the default depths up to `max_depth`, or the default
     sample counts. `others` are further fields. Raises ConfigError.
     """
     usual = depths(max_depth) if swept == "depth" else sample_counts(config.run.spp)
-    return Plan.of(config, integrators, BENCHED, swept=swept, values=sorted(values or usual), **others)
+    return MeasurementPlan.of(config, integrators, BENCHED, swept=swept, values=sorted(values or usual), **others)
 
 
 def convergence_plan(
     config: Config, objective: str, integrators: str | None, reference: str | None, spps: Sequence[int], **others: Any
-) -> Plan:
+) -> MeasurementPlan:
     """Return the plan of `convergence`. Without `spps`, steps have the samples per pixel of `run`. `others` are further
     fields. Raises ConfigError.
     """
@@ -374,6 +379,6 @@ def convergence_plan(
     if len(stands) != 1:
         raise ConfigError("--reference", "", "errors are relative to one method; name one")
     values = spps or [config.run.spp]
-    return Plan.of(
+    return MeasurementPlan.of(
         config, integrators, DEFAULTS[objective], quantity=objective, values=values, reference=stands[0], **others
     )

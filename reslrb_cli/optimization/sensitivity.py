@@ -117,12 +117,14 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
     optimizer, measured, spp = problem.optimizer, [], problem.config.run.spp
     starts = {key: dr.detach(optimizer[key]) for key in problem.selection.keys}
     problem.apply()
+    images = see_images(problem, 2 * _sample_counts(problem)[0])
+    size = math.sqrt(sum(float(np.square(finite(image)).sum()) for image in images))
     for key, start in starts.items():
         variable = optimizer.variable(key)
         v = variable.from_scene(start)
         gradient = finite(_gradients_at(problem, key, v, spp, [0])[0])
         row = Scaled(key, gradient.size, rms(np.array(start)), rms(gradient))
-        found = _steepest(problem, key, v, gradient)
+        found = _steepest(problem, key, v, gradient, size)
         optimizer.set_value(key, start)
         if found > 0:
             unit = replace(variable, gain=1 / (found * len(starts)))
@@ -135,13 +137,12 @@ def measure_curvatures(problem: Problem) -> list[Scaled]:
     return measured
 
 
-def _steepest(problem: Problem, key: str, v: Any, gradient: Array) -> float:
+def _steepest(problem: Problem, key: str, v: Any, gradient: Array, size: float) -> float:
     """Return the loss's largest curvature in `v`, the optimiser's variable of `key`. Return 0 if `v` has no visible
-    effect. The scene must have the values of `v`.
+    effect. `size` is the L2 norm of the images at the start.
     """
     counts = _sample_counts(problem)
-    spp, base = 2 * counts[0], see_images(problem, 2 * counts[0])
-    size = math.sqrt(sum(float(np.square(finite(image)).sum()) for image in base))
+    spp = 2 * counts[0]
     direction = gradient / (np.linalg.norm(gradient) or 1.0)
     step = 0.01 * (rms(np.array(v)) or 1.0) * math.sqrt(gradient.size)
     variable = problem.optimizer.variable(key)

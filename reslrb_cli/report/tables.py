@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from reslrb_cli.measure.comparison import MOST_FREEDOM
 from reslrb_cli.measure.judgement import CONFIDENCE, ConvergenceResults
+from reslrb_cli.measure.methods import with_option
 from reslrb_cli.records.measurement_files import Line
 from reslrb_cli.records.measurements import (
     TARGETS,
@@ -92,9 +93,7 @@ def integrator_name(record: GradcheckRecord) -> str:
     does not use light paths.
     """
     name, paths = record.label, record.options.get("paths", "light")
-    if paths == "light" or "paths=" in name:
-        return name
-    return f"{name.removesuffix(')')}{',' if name.endswith(')') else '('}paths={paths})"
+    return name if paths == "light" or "paths=" in name else with_option(name, f"paths={paths}")
 
 
 def reference_name(record: GradcheckRecord) -> str:

@@ -30,7 +30,7 @@ from reslrb_cli.config.loader import changed, dump, load, with_integrator
 from reslrb_cli.measure import bench
 from reslrb_cli.measure import convergence as session
 from reslrb_cli.measure.convergence import Session
-from reslrb_cli.measure.methods import Plan
+from reslrb_cli.measure.methods import MeasurementPlan
 
 #: Settings that make a run cheap and exactly repeatable.
 FAST = {"run.certainty": False, "run.iterations": 3}
@@ -278,7 +278,7 @@ class Played(Session):
     """Session with simulated processes, and a clock that only these processes advance."""
 
     def __init__(
-        self, plan: Plan, stop: Callable[[], bool], say: Callable[[str], None], spent_s: float, **given: Any
+        self, plan: MeasurementPlan, stop: Callable[[], bool], say: Callable[[str], None], spent_s: float, **given: Any
     ) -> None:
         stage = Stage()
         super().__init__(plan, stop, say, start=stage.start, now=stage.clock, **given)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.measure.scenes.case import Differences, SceneCase, Source
-from reslrb_cli.measure.scenes.catalogue import FLOOR, LAMP, OPACITY, PRB, PTRACER, TEXELS, VEIL, WALL, veiled
+from reslrb_cli.measure.scenes.catalogue import FLOOR, LAMP, OPACITY, PRB, PTRACER, TEXELS, VEIL, WALL
 from reslrb_cli.measure.scenes.moving import mesh
 from reslrb_cli.measure.scenes.small import (
     bitmap,
@@ -29,6 +29,7 @@ from reslrb_cli.measure.scenes.small import (
     sphere,
     texture,
     transform,
+    veiled,
 )
 
 FD = Differences(0.05)

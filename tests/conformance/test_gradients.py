@@ -30,8 +30,7 @@ from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
 from reslrb_cli.measure.scenes.case import Differences, SceneCase
-from reslrb_cli.measure.scenes.catalogue import veiled
-from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform
+from reslrb_cli.measure.scenes.small import bitmap, diffuse, lamp, rgb, room, texture, transform, veiled
 from reslrb_cli.scene.upsampling import DARKEST
 
 pytestmark = pytest.mark.usefixtures("llvm")

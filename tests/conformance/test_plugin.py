@@ -26,8 +26,7 @@ from reslrb_cli.errors import UnsupportedScene
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.step import Adjoint, gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator, relative, seeds
-from reslrb_cli.measure.scenes.catalogue import veiled
-from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform
+from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, rgb, room, transform, veiled
 
 pytestmark = pytest.mark.usefixtures("llvm")
 ROOT = Path(__file__).resolve().parents[2]

@@ -21,8 +21,7 @@ from turns import a_few
 
 from reslrb_cli.integrators.step import gradient_step, render_image
 from reslrb_cli.measure.gradients import Case, integrator
-from reslrb_cli.measure.scenes.catalogue import veiled
-from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, load, rgb, room
+from reslrb_cli.measure.scenes.small import camera, diffuse, lamp, load, rgb, room, veiled
 from reslrb_cli.scene.rays import no_wavelengths
 from reslrb_cli.transport.film import AdjointImage, Film
 

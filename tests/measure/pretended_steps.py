@@ -15,7 +15,7 @@ from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.draws import DrawsFile
 from reslrb_cli.measure.engine import STEPS
 from reslrb_cli.measure.judgement import ConvergenceResults, Judgement
-from reslrb_cli.measure.methods import Plan, parse_cases
+from reslrb_cli.measure.methods import MeasurementPlan, parse_cases
 from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
 from reslrb_cli.records.measurements import BenchStatus, MethodRecord
 
@@ -207,17 +207,17 @@ LIST = "ptracer,reslrb:stack,reslrb:event"
 SIGNAL = float(TRUTH @ TRUTH)
 
 
-def plan(cases: str = LIST, **changes: Any) -> Plan:
+def plan(cases: str = LIST, **changes: Any) -> MeasurementPlan:
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(cases), "values": [4],
         "reference": parse_cases("reslrb:stack")[0], "quantity": "fixed", "memory_limit": None,
         "budget_s": 0.0, "rounds": 32,
     }  # fmt: skip
-    return Plan(**(values | changes))
+    return MeasurementPlan(**(values | changes))
 
 
 def play(
-    stage: Stage, what: Plan, stop: Callable[[], bool] = lambda: False, file: Path | None = None
+    stage: Stage, what: MeasurementPlan, stop: Callable[[], bool] = lambda: False, file: Path | None = None
 ) -> tuple[Session, ConvergenceResults, list[str]]:
     said: list[str] = []
     session = Session(what, stop, said.append, start=stage.start, now=stage.clock, file=DrawsFile(file))

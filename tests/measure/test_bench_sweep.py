@@ -14,7 +14,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure import engine
 from reslrb_cli.measure.bench import Bench
 from reslrb_cli.measure.engine import NO_TIME
-from reslrb_cli.measure.methods import BENCH_ROUNDS, Plan, bench_plan, depths, parse_cases, sample_counts
+from reslrb_cli.measure.methods import BENCH_ROUNDS, MeasurementPlan, bench_plan, depths, parse_cases, sample_counts
 from reslrb_cli.measure.processes import CannotStart, Stopped
 from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
 from reslrb_cli.report.tables import bench_cells, bench_columns
@@ -36,16 +36,16 @@ def _clean() -> None:
     Pretended.log, Pretended.ends, Pretended.refusing, Pretended.alive = [], {}, set(), 0
 
 
-def sweep(list_of: str = LIST, **changes: Any) -> Plan:
+def sweep(list_of: str = LIST, **changes: Any) -> MeasurementPlan:
     values: dict[str, Any] = {
         "config": loads(CONFIG, Path("x.yaml")), "variant": "llvm_ad_rgb", "cases": parse_cases(list_of),
         "swept": "depth", "values": [2, 4], "memory_limit": None, "budget_s": 0.0, "rounds": 3,
     }  # fmt: skip
-    return Plan(**(values | changes))
+    return MeasurementPlan(**(values | changes))
 
 
 def play(
-    what: Plan, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
+    what: MeasurementPlan, kind: type[Pretended] = Pretended, stop: Callable[[], bool] = lambda: False, **options: Any
 ) -> tuple[list[BenchRecord], list[str]]:
     said: list[str] = []
     rows = [row for depth in Bench(what, stop, said.append, start=kind, **options).run() for row in depth]
@@ -53,7 +53,7 @@ def play(
     return rows, said
 
 
-def run(what: Plan, stop: Callable[[], bool] = lambda: False) -> list[BenchRecord]:
+def run(what: MeasurementPlan, stop: Callable[[], bool] = lambda: False) -> list[BenchRecord]:
     return play(what, stop=stop)[0]
 
 

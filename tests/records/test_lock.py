@@ -130,7 +130,7 @@ def test_another_machine_may_hold_an_invisible_lock(tmp_path: Path, monkeypatch:
 
 
 def test_a_folder_that_cannot_be_opened_has_no_lock_to_test(tmp_path: Path) -> None:
-    """The number of the process decides, on this machine alone."""
+    """On the same machine, the process ID decides who holds the lock."""
     here = Holder.here(locked=True)
     assert not here.is_gone(tmp_path / "gone")
     assert replace(here, pid=ended_pid()).is_gone(tmp_path / "gone")

@@ -576,7 +576,7 @@ def test_images_of_several_views_are_named_by_their_sensors() -> None:
 
 
 def test_the_first_error_at_the_end_is_raised() -> None:
-    """All callbacks are told of the end."""
+    """Every callback is called at the end."""
 
     class Other(Listener):
         """Another class, which the message names."""

@@ -284,7 +284,7 @@ taken: list[object] = []
 
 
 def test_a_context_is_taken_again_after_one_that_failed(me: SimpleNamespace) -> None:
-    """The failed one may have changed a part of the state."""
+    """The failed context may have changed a part of the state."""
     me.plugins["reslrb"] = workload = calls.Workload({"a": b"one"}, reads)
     taken.clear()
     for context, number in ((_Noted(), 1), (_Noted(), 1), (_Broken(), 1), (_Noted(), 2)):

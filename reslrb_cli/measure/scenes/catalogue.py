@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.measure.scenes.analytic import (
@@ -40,20 +39,33 @@ from reslrb_cli.measure.scenes.moving import (
 )
 from reslrb_cli.measure.scenes.small import (
     bitmap,
+    bright,
     camera,
+    columns,
+    dark,
     diffuse,
     glass,
     lamp,
+    lit,
     lit_square,
     look_at,
     matte,
+    normal_map,
     pinhole,
+    placed,
     rectangle,
     rgb,
     room,
+    skimming,
+    small_lamp,
     sphere,
+    sun,
     texture,
     transform,
+    turned_panes,
+    two_lamps,
+    veiled,
+    vertical_light,
 )
 
 FLOOR, TEXELS = "floor.brdf_0.reflectance.value", "floor.brdf_0.reflectance.data"
@@ -71,22 +83,6 @@ TRACED: dict[str, Any] = {"image": "ptracer", "spp": 512}
 NO_BLACK_LAMP = "Mitsuba loads no lamp without light"
 
 # ---- Colours at the ends of their range ----
-
-
-def columns(*texels: tuple[float, ...]) -> dict:
-    """A matte surface whose texture has these columns and two rows. Mitsuba needs at least two rows."""
-    row = np.array(texels, float).reshape(1, len(texels), -1)
-    return matte(bitmap(np.repeat(row, 2, 0)))
-
-
-def dark(value: float) -> dict:
-    """The room, with one black or nearly black texel on the floor."""
-    return room(floor=columns((value, value, value), (0.6, 0.3, 0.5)))
-
-
-def bright(value: float) -> dict:
-    """The room, with a white or nearly white floor and wall."""
-    return room(floor=columns((value, value, value), (value, 0.3, value)), wall=matte(value, value, value))
 
 
 COLOURS = [
@@ -117,37 +113,6 @@ COLOURS = [
 ]  # fmt: skip
 
 # ---- Lamps, and boxes that light fills ----
-
-
-def lit(scale: float) -> dict:
-    """The room with the lamp's radiance multiplied by `scale`."""
-    return room(lamp=lamp(radiance=rgb(3 * scale, 4 * scale, 5 * scale)))
-
-
-def two_lamps() -> dict:
-    place = transform(translate=[0.9, 0.8, 1.6], rotate=([1, 0.5, 0], 120), scale=0.4)
-    return room(lamp=lamp(radiance=rgb(1e25, 2e25, 3e25)),
-                dim=lamp(radiance=rgb(3e-25, 2e-25, 1e-25)) | {"to_world": place})  # fmt: skip
-
-
-def small_lamp(radiance: float) -> dict:
-    """A lamp with sides of length 1e-4."""
-    tiny = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.5e-4)
-    return room(lamp=lamp(radiance=rgb(radiance, 2 * radiance, radiance)) | {"to_world": tiny})
-
-
-def sun() -> dict:
-    """A sky of 8 x 16 texels, one of which is a million times brighter than the others."""
-    sky = np.random.default_rng(2).uniform(0.5, 1.5, (8, 16, 3)).astype(np.float32)
-    sky[2, 5] = 1e6
-    return room(lamp=None, sky={"type": "envmap", "bitmap": mi.Bitmap(sky)})
-
-
-def skimming() -> dict:
-    """Parallel light that meets the floor at half a degree from the floor's plane."""
-    height = float(np.tan(np.deg2rad(0.5)))
-    light = {"type": "directional", "direction": [-0.9, -height, -0.43], "irradiance": rgb(90, 80, 70)}
-    return room(lamp=None, wall_shape=None, side_shape=None, light=light)
 
 
 def parallel(start: Sequence[float], end: Sequence[float], half: float, radiance: dict, up: Any = (0, 0, 1)) -> dict:
@@ -229,51 +194,12 @@ LIGHTS = [
 # ---- Sizes, places, and normals ----
 
 
-def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
-    """The room, scaled about the origin and then moved. The radiance is scaled so that the image stays the same."""
-    scene = room()
-    move = transform(translate=list(offset), scale=scale)
-    for name, item in scene.items():
-        if isinstance(item, dict) and "to_world" in item:
-            scene[name] = item | {"to_world": move @ item["to_world"]}
-    view = np.array(room()["camera"]["to_world"].matrix)
-    view[:3, 3] = scale * view[:3, 3] + np.asarray(offset)
-    scene["camera"] |= {"to_world": mi.ScalarTransform4f(view), "near_clip": 1e-2 * scale, "far_clip": 1e4 * scale}
-    return scene
-
-
-def vertical_light() -> dict:
-    """A lamp that stands upright on the floor's edge. Nearly all of the lamp's light arrives on the floor at grazing
-    angles.
-    """
-    place = transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1])
-    return room(lamp=lit_square(rgb(9, 8, 7), place))
-
-
-def turned_panes() -> dict:
-    """Two sheets that scatter on one side only. One sheet shows its back to the camera, the second sheet to the
-    lamp.
-    """
-
-    def pane(tilt: float, **place: Any) -> dict:
-        return rectangle(diffuse(0.8, 0.6, 0.7), **place, rotate=([1, 0, 0], tilt), scale=0.35)
-
-    return room(first=pane(160, translate=[0.4, -0.2, 0.6]), second=pane(40, translate=[-0.4, -0.3, 0.5]))
-
-
 def octahedron(*reflectance: float) -> dict:
     """A solid of eight flat faces, shaded as a sphere."""
     corners = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float32)
     faces = [(x, y, z) if (x + y + z) % 2 == 0 else (y, x, z) for x in (0, 1) for y in (2, 3) for z in (4, 5)]
     positions = 0.5 * corners + [0.1, -0.3, 0.2]
     return room(solid=mesh(positions, np.array(faces), diffuse(*reflectance), normals=corners, name="solid"))
-
-
-def normal_map() -> dict:
-    """A floor with a normal map whose normals lean by up to 60 degrees."""
-    lean = np.random.default_rng(5).uniform(0.2, 0.8, (4, 4, 2))
-    normals = bitmap(np.concatenate([lean, np.full((4, 4, 1), 0.75)], -1), "bilinear") | {"raw": True}
-    return room(floor={"type": "normalmap", "normalmap": normals, "bsdf": diffuse(0.7, 0.5, 0.6)})
 
 
 ALL = (FLOOR, WALL, LAMP)
@@ -416,13 +342,6 @@ FILMS = [
 ]  # fmt: skip
 
 # ---- Masks and glass ----
-
-
-def veiled(opacity: Any, place: dict[str, Any] | None = None, **changes: Any) -> dict:
-    """The room with a partly opaque sheet. By default, it hangs between lamp and floor."""
-    bsdf = {"type": "mask", "opacity": opacity, "id": "veil_bsdf", "bsdf": matte(0.7, 0.6, 0.3)}
-    place = place or {"translate": [0.1, 0.2, 0.2], "rotate": ([1, 0, 0], -80), "scale": 0.5}
-    return room(veil=rectangle(bsdf, **place), **changes)
 
 
 def nested() -> dict:

@@ -2,6 +2,7 @@
 
 `build` returns the Cornell box with a texture on its white surfaces. Measurements without a configuration use the
 Cornell box. `room` returns the corner of a room as a dictionary for `mi.load_dict`. Gradient checks add objects to it.
+Functions such as `dark` and `veiled` return variations of the room.
 """
 
 from __future__ import annotations
@@ -171,6 +172,99 @@ def lamp(**emitter: Any) -> dict:
     """A square area light above the room that shines down. `emitter` has options of the `area` emitter."""
     place = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.6)
     return rectangle(diffuse(0.0, 0.0, 0.0), place) | {"emitter": {"type": "area", **emitter}}
+
+
+def columns(*texels: tuple[float, ...]) -> dict:
+    """A matte surface whose texture has these columns and two rows. Mitsuba needs at least two rows."""
+    row = np.array(texels, float).reshape(1, len(texels), -1)
+    return matte(bitmap(np.repeat(row, 2, 0)))
+
+
+def dark(value: float) -> dict:
+    """The room, with one black or nearly black texel on the floor."""
+    return room(floor=columns((value, value, value), (0.6, 0.3, 0.5)))
+
+
+def bright(value: float) -> dict:
+    """The room, with a white or nearly white floor and wall."""
+    return room(floor=columns((value, value, value), (value, 0.3, value)), wall=matte(value, value, value))
+
+
+def lit(scale: float) -> dict:
+    """The room with the lamp's radiance multiplied by `scale`."""
+    return room(lamp=lamp(radiance=rgb(3 * scale, 4 * scale, 5 * scale)))
+
+
+def two_lamps() -> dict:
+    place = transform(translate=[0.9, 0.8, 1.6], rotate=([1, 0.5, 0], 120), scale=0.4)
+    return room(lamp=lamp(radiance=rgb(1e25, 2e25, 3e25)),
+                dim=lamp(radiance=rgb(3e-25, 2e-25, 1e-25)) | {"to_world": place})  # fmt: skip
+
+
+def small_lamp(radiance: float) -> dict:
+    """A lamp with sides of length 1e-4."""
+    tiny = transform(translate=[0.2, 1.6, 0.2], rotate=([1, 0, 0], 90), scale=0.5e-4)
+    return room(lamp=lamp(radiance=rgb(radiance, 2 * radiance, radiance)) | {"to_world": tiny})
+
+
+def sun() -> dict:
+    """A sky of 8 x 16 texels, one of which is a million times brighter than the others."""
+    sky = np.random.default_rng(2).uniform(0.5, 1.5, (8, 16, 3)).astype(np.float32)
+    sky[2, 5] = 1e6
+    return room(lamp=None, sky={"type": "envmap", "bitmap": mi.Bitmap(sky)})
+
+
+def skimming() -> dict:
+    """Parallel light that meets the floor at half a degree from the floor's plane."""
+    height = float(np.tan(np.deg2rad(0.5)))
+    light = {"type": "directional", "direction": [-0.9, -height, -0.43], "irradiance": rgb(90, 80, 70)}
+    return room(lamp=None, wall_shape=None, side_shape=None, light=light)
+
+
+def placed(scale: float = 1, offset: Any = (0, 0, 0)) -> dict:
+    """The room, scaled about the origin and then moved. The radiance is scaled so that the image stays the same."""
+    scene = room()
+    move = transform(translate=list(offset), scale=scale)
+    for name, item in scene.items():
+        if isinstance(item, dict) and "to_world" in item:
+            scene[name] = item | {"to_world": move @ item["to_world"]}
+    view = np.array(room()["camera"]["to_world"].matrix)
+    view[:3, 3] = scale * view[:3, 3] + np.asarray(offset)
+    scene["camera"] |= {"to_world": mi.ScalarTransform4f(view), "near_clip": 1e-2 * scale, "far_clip": 1e4 * scale}
+    return scene
+
+
+def vertical_light() -> dict:
+    """A lamp that stands upright on the floor's edge. Nearly all of the lamp's light arrives on the floor at grazing
+    angles.
+    """
+    place = transform(translate=[0, -0.99, 0.999], rotate=([0, 1, 0], 180), scale=[1, 0.01, 1])
+    return room(lamp=lit_square(rgb(9, 8, 7), place))
+
+
+def turned_panes() -> dict:
+    """Two sheets that scatter on one side only. One sheet shows its back to the camera, the second sheet to the
+    lamp.
+    """
+
+    def pane(tilt: float, **place: Any) -> dict:
+        return rectangle(diffuse(0.8, 0.6, 0.7), **place, rotate=([1, 0, 0], tilt), scale=0.35)
+
+    return room(first=pane(160, translate=[0.4, -0.2, 0.6]), second=pane(40, translate=[-0.4, -0.3, 0.5]))
+
+
+def normal_map() -> dict:
+    """A floor with a normal map whose normals lean by up to 60 degrees."""
+    lean = np.random.default_rng(5).uniform(0.2, 0.8, (4, 4, 2))
+    normals = bitmap(np.concatenate([lean, np.full((4, 4, 1), 0.75)], -1), "bilinear") | {"raw": True}
+    return room(floor={"type": "normalmap", "normalmap": normals, "bsdf": diffuse(0.7, 0.5, 0.6)})
+
+
+def veiled(opacity: Any, place: dict[str, Any] | None = None, **changes: Any) -> dict:
+    """The room with a partly opaque sheet. By default, it hangs between lamp and floor."""
+    bsdf = {"type": "mask", "opacity": opacity, "id": "veil_bsdf", "bsdf": matte(0.7, 0.6, 0.3)}
+    place = place or {"translate": [0.1, 0.2, 0.2], "rotate": ([1, 0, 0], -80), "scale": 0.5}
+    return room(veil=rectangle(bsdf, **place), **changes)
 
 
 def load(scene: dict) -> Any:
