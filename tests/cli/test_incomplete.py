@@ -268,9 +268,12 @@ def test_shares_have_standard_errors():
     assert share_of(random.normal(size=(8, 2)), np.ones((8, 2))) is None
 
 
-def simulated(directions: int, share: float, whole: float, noise: float, count: int) -> list[MissingRecord]:
-    """Return records of measurements with known shares. The differences have the means `whole`. The missing parts have
-    the standard deviation `noise`, and the differences have twice as much.
+def simulated(
+    directions: int, share: float, whole: float, noise: float, count: int, samples: int = 480
+) -> list[MissingRecord]:
+    """Return records of measurements with known shares, of at most `samples` samples for each direction. The
+    differences have the means `whole`. The missing parts have the standard deviation `noise`, and the differences have
+    twice as much.
     """
     random = np.random.default_rng(5)
 
@@ -293,8 +296,15 @@ def simulated(directions: int, share: float, whole: float, noise: float, count: 
     found = []
     for _ in range(count):
         check.tracing = tracing = Simulated([], None, None, 1)
-        found.append(check.measured("x", lambda more, own=tracing: own.spent + more <= 480 * directions))
+        found.append(check.measured("x", lambda more, own=tracing: own.spent + more <= samples * directions))
     return found
+
+
+@pytest.mark.parametrize(("samples", "seeds"), [(35, 0), (36, missing.FEWEST)])
+def test_a_measurement_begins_only_if_it_can_end(samples: int, seeds: int) -> None:
+    """A trial takes 4 samples, both images for dL/dI take 8, and the fewest seeds take 24."""
+    [record] = simulated(1, 0.0, 1.0, 0.1, 1, samples)
+    assert record.seeds == seeds
 
 
 def test_all_looks_together_keep_the_probability_of_a_false_alarm():

@@ -96,8 +96,9 @@ def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None
     assert rows[5].status is BenchStatus.OK  # the case is tried again at the next depth
 
 
-def test_without_a_baseline_there_are_no_ratios() -> None:
-    Pretended.ends = {("ptracer", 2): 1}
+@pytest.mark.parametrize("question", [1, 5], ids=["cold", "in a round"])
+def test_without_a_baseline_there_are_no_ratios(question: int) -> None:
+    Pretended.ends = {("ptracer", 2): question}
     rows = run(sweep())
     assert [row.step_ratio is None for row in rows] == [True, True, True, False, False, False]
 

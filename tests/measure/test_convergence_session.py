@@ -247,8 +247,9 @@ def test_a_refusal_is_remembered(tmp_path: Path) -> None:
     assert again.asked == []
 
 
-def test_too_many_draws_for_the_memory_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(convergence, "MEMORY", 4 * 63 * 12 * 5)
+@pytest.mark.parametrize(("fitting", "rounds"), [(5, 5), (1, convergence.FEWEST + 1)])
+def test_too_many_draws_for_the_memory_are_reported(fitting: int, rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(convergence, "MEMORY", 4 * 63 * 12 * fitting)
     session, _, said = play(Stage(), plan("ptracer,reslrb:stack", rounds=9))
-    assert session.rounds == 5
-    assert "the memory for draws ends after 5 rounds" in said
+    assert session.rounds == rounds
+    assert f"the memory for draws ends after {rounds} rounds" in said

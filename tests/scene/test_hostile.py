@@ -176,7 +176,7 @@ def test_elements_nested_too_deeply_are_one_line(tmp_path, text):
 WEIGHT = '<float name="weight" value="0.5"/>'
 
 
-@pytest.mark.parametrize("case", ["twosided", "blendbsdf", "mask"])
+@pytest.mark.parametrize("case", ["twosided", "blendbsdf", "mask", "mask, last part first"])
 def test_a_bsdf_with_too_many_parts_is_one_line(tmp_path, case):
     """Mitsuba visits a part as often as it is used. A chain of a few parts is no problem."""
 
@@ -186,13 +186,15 @@ def test_a_bsdf_with_too_many_parts_is_one_line(tmp_path, case):
             return f"<shape type='sphere'>{nested}</shape>"
         parts = ['<bsdf type="diffuse" id="b0"/>']
         for n in range(number):
-            use = f'<ref id="b{n}"/>' if case == "mask" else f'<ref id="b{n}"/><ref id="b{n}"/>{WEIGHT}'
-            parts.append(f'<bsdf type="{case}" id="b{n + 1}">{use}</bsdf>')
+            use = f'<ref id="b{n}"/>' if long else f'<ref id="b{n}"/><ref id="b{n}"/>{WEIGHT}'
+            parts.append(f'<bsdf type="{case.split(",")[0]}" id="b{n + 1}">{use}</bsdf>')
+        parts = parts[::-1] if "," in case else parts
         return "".join(parts) + f"<shape type='sphere'><ref id='b{number}'/></shape>"
 
-    file = write(tmp_path, f"{HEAD}{text(3)}</scene>")
+    long = case.startswith("mask")
+    file = write(tmp_path, f"{HEAD}{text(990 if long else 3)}</scene>")
     load_scene(file)
-    write(tmp_path, f"{HEAD}{text(3000 if case == 'mask' else 90)}</scene>")
+    write(tmp_path, f"{HEAD}{text(3000 if long else 90)}</scene>")
     with pytest.raises(ConfigError, match=rf"{file}:\d+: .*has more than 1000 nested BSDFs and textures"):
         load_scene(file)
 

@@ -154,22 +154,22 @@ _MOST_PARTS = 1000
 
 def _check_parts(root: Element) -> None:
     """Refuse a BSDF with too many parts: Mitsuba would never finish. 90 nested `twosided` BSDFs have 2**90 parts."""
-    by_id, parts = root.by_id(), dict[Element, int]()
-
-    def count(element: Element) -> int:
-        if element not in parts:
-            parts[element] = 1  # ends circles, which Mitsuba refuses
-            used = [by_id.get(child.id, child) if child.tag == "ref" else child for child in element.children]
-            number = sum(count(child) for child in used if child.tag in ("bsdf", "texture"))
-            parts[element] = 1 + number * (2 if element.type == "twosided" and len(used) == 1 else 1)
-        return parts[element]
-
+    by_id, parts, begun = root.by_id(), dict[Element, int](), set[Element]()
     for element in root.walk("bsdf"):
-        try:
-            number = count(element)
-        except RecursionError:
-            number = _MOST_PARTS + 1
-        if number > _MOST_PARTS:
+        pending = [element]
+        while pending:  # no recursion, because chains of references can be long
+            top = pending[-1]
+            used = [by_id.get(child.id, child) if child.tag == "ref" else child for child in top.children]
+            nested = [child for child in used if child.tag in ("bsdf", "texture")]
+            lacking = [child for child in nested if child not in parts]
+            if lacking and top not in begun:  # in a circle, which Mitsuba refuses, each part is begun once
+                begun.add(top)
+                pending += lacking
+                continue
+            pending.pop()
+            uses = 2 if top.type == "twosided" and len(used) == 1 else 1
+            parts[top] = 1 + uses * sum(parts.get(child, 1) for child in nested)
+        if parts[element] > _MOST_PARTS:
             what = f"has more than {_MOST_PARTS} nested BSDFs and textures, counting each use"
             raise element.fail("", f"{what}; a `twosided` uses its BSDF twice, and needs no other `twosided`")
 
