@@ -143,7 +143,7 @@ PLACES = {
     "auto, moving": {"step update exposed_images"},
     "sgd": {
         "measure_curvatures _gradients_at sample_gradient", "measure_curvatures _steepest see_images",
-        "_steepest _gradients_at sample_gradient",
+        "_steepest _gradients_at sample_gradient", "step measure_curvatures see_images",
     },
     "exposure": {"find_ambiguous _row see_images"},
 }  # fmt: skip

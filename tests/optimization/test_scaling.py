@@ -55,6 +55,24 @@ def test_the_curvature_of_a_lamp_matches_its_image():
     assert scale_line(row) == f"{LAMP} moves by about {row.first_step:.3g} at first"
 
 
+def test_the_size_of_the_images_is_measured_once(monkeypatch):
+    """The search for a step compares changes of the images with their L2 norm at the start."""
+    problem, sizes, rendered = assemble(load(CONFIG, [*TINY, DESCENT])), [], []
+    see_images = sensitivity.see_images
+
+    def seen(problem, spp):
+        rendered.append(spp)
+        return see_images(problem, spp)
+
+    monkeypatch.setattr(sensitivity, "see_images", seen)
+    monkeypatch.setattr(sensitivity, "_steepest", lambda *given: sizes.append(given[-1]) or 0.0)
+    rows = measure_curvatures(problem)
+    assert rendered == [4]  # two halves of 32 / 16 samples
+    expected = np.sqrt(sum(np.square(image, dtype=np.float64).sum() for image in see_images(problem, 4)))
+    assert sizes == pytest.approx([expected] * len(rows), rel=1e-4)
+    assert len(rows) > 1
+
+
 @pytest.mark.parametrize(("rate", "ends"), [(1.0, "below"), (3.0, "above")])
 def test_a_rate_of_one_converges_and_a_rate_of_three_diverges(rate, ends):
     sets = [*TINY, *LAMP_ALONE, "run.iterations=12", f"optimizer.learning_rate={rate}"]
@@ -111,7 +129,8 @@ def test_the_samples_of_a_curvature_follow_from_its_noise(noise, most, size, llv
         counts.append([])
         problem.apply()
         start = np.r_[1.0, np.full(size - 1, 0.02)]
-        found.append(sensitivity._steepest(problem, "albedo", problem.optimizer["albedo"], start))
+        size_of_image = float(np.linalg.norm(np.array(problem.selection.params["albedo"])))
+        found.append(sensitivity._steepest(problem, "albedo", problem.optimizer["albedo"], start, size_of_image))
     assert np.median([max(each) for each in counts]) == most
     assert all(each == sorted(each) and each[0] == 4 for each in counts)
     if most < 32:
