@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import os
 import re
 import subprocess
 import sys
@@ -187,6 +188,16 @@ def test_packages_are_imported_where_they_are_needed() -> None:
     script += "\nimport reslrb_cli.runs.recorder\nassert not {'matplotlib', 'scipy.special'} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_commands_load_numpy_and_scipy_without_idle_threads() -> None:
+    script = "import os, reslrb_cli.cli, numpy, scipy.linalg; print(len(os.listdir('/proc/self/task')))"
+    environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment)
+    assert int(done.stdout) == 1
+    environment["OPENBLAS_NUM_THREADS"] = "3"  # the user's choice counts
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment)
+    assert int(done.stdout) > 1 or os.cpu_count() == 1
 
 
 def test_every_module_can_be_imported_without_a_variant() -> None:

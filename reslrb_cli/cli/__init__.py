@@ -21,6 +21,10 @@ from reslrb_cli.cli.terminal import Interrupts, LogLines, tell
 from reslrb_cli.errors import LINE_LENGTH, ExitCode, did_you_mean, one_line
 from reslrb_cli.version import __version__
 
+# OpenBLAS reads this when NumPy is loaded. Its idle threads wait actively: on busy cores, a product of two vectors then
+# takes 100 times as long. All large arrays of a command belong to Dr.Jit, which has its own threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Summaries for `reslrb --help`, which does not load the commands; in the order of a user's work.
 _SUMMARIES = {
     "example": "Copy an experiment that comes with the program.",
