@@ -217,12 +217,19 @@ def _padded(h: Array, slopes: list[Array], cell: tuple[float, float]) -> Array:
 
 def _faces(p: Array, cell: tuple[float, float]) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Return (h, gx, gy) from a padded h, at the faces across x (ny, nx + 1) and at the faces across y (ny + 1, nx)."""
+    row, column = p[1:-1], p[:, 1:-1]
+    across_x, across_y = _slopes(p, cell)
+    return ((row[:, 1:] + row[:, :-1]) / 2, *across_x), ((column[1:] + column[:-1]) / 2, *across_y)
+
+
+def _slopes(p: Array, cell: tuple[float, float]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return (gx, gy) from a padded h, at the faces across x (ny, nx + 1) and at the faces across y (ny + 1, nx)."""
     dx, dy = cell
     row, column = p[1:-1], p[:, 1:-1]
-    along_y, along_x = (p[2:] - p[:-2]) / (2 * dy), (p[:, 2:] - p[:, :-2]) / (2 * dx)
+    along_y, along_x = p[2:] - p[:-2], p[:, 2:] - p[:, :-2]
     return (
-        ((row[:, 1:] + row[:, :-1]) / 2, np.diff(row, axis=1) / dx, (along_y[:, 1:] + along_y[:, :-1]) / 2),
-        ((column[1:] + column[:-1]) / 2, (along_x[1:] + along_x[:-1]) / 2, np.diff(column, axis=0) / dy),
+        ((row[:, 1:] - row[:, :-1]) / dx, (along_y[:, 1:] + along_y[:, :-1]) / (4 * dy)),
+        ((along_x[1:] + along_x[:-1]) / (4 * dx), (column[1:] - column[:-1]) / dy),
     )
 
 
@@ -274,7 +281,8 @@ class _Equation:
         )
         if self.fits:
             even = (target[0] / state.size[0]) * (target[1] / state.size[1])
-            self.F = np.log(self.det / even * self._over_cells(self.nu) / self.mu)
+            self.seen = self._over_cells(self.nu, target)
+            self.F = np.log(self.det / even * self.seen / self.mu)
             self.F -= np.mean(self.mu * self.F)
             self.merit = float(np.sqrt(np.mean(self.mu * self.F**2)))
         else:
@@ -286,15 +294,13 @@ class _Equation:
     def _center(self, T: list[Array]) -> Array:
         return (T[0][:, :, 1:] + T[0][:, :, :-1] + T[1][:, 1:] + T[1][:, :-1]) / 4
 
-    def _over_cells(self, nu: Array, by: tuple[float, float] = (0.0, 0.0)) -> Array:
-        """Return the mean of nu over each cell's image under T, computed from four points. The images are shifted by
-        `by`.
-        """
+    def _over_cells(self, values: Array, size: tuple[float, float]) -> Array:
+        """Return the mean of `values` (`sample`) over each cell's image under T, computed from four points."""
         total = np.zeros(self.det.shape)
         for a in (-0.25, 0.25):
             for b in (-0.25, 0.25):
                 u, v = self.center + self.D[:, 0] * (a * self.cell[0]) + self.D[:, 1] * (b * self.cell[1])
-                total += sample(nu, self.target, u + by[0], v + by[1])
+                total += sample(values, size, u, v)
         return total / 4
 
     def linearize(self) -> None:
@@ -310,21 +316,23 @@ class _Equation:
         self.weights = float(np.mean(A[0, 0] * scale)), float(np.mean(A[1, 1] * scale))
         ny, nx = self.nu.shape
         dx, dy = self.target[0] / nx, self.target[1] / ny
-        self.slope = scale / self._over_cells(self.nu) * np.stack([
-            (self._over_cells(self.nu, (dx / 2, 0)) - self._over_cells(self.nu, (-dx / 2, 0))) / dx,
-            (self._over_cells(self.nu, (0, dy / 2)) - self._over_cells(self.nu, (0, -dy / 2))) / dy,
+        wide, high = np.pad(self.nu, ((0, 0), (1, 1)), mode="edge"), np.pad(self.nu, ((1, 1), (0, 0)), mode="edge")
+        self.slope = scale / self.seen * np.stack([  # from pixel to pixel, linear between the pixels' edges
+            self._over_cells(np.diff(wide, axis=1) / dx, (self.target[0] + dx, self.target[1])),
+            self._over_cells(np.diff(high, axis=0) / dy, (self.target[0], self.target[1] + dy)),
         ])  # fmt: skip
 
     def along(self, v: Array) -> Array:
         """Return the derivative of (1)'s logarithm along v (ny, nx), times `scale`. v has slopes of 0 at the edges."""
         p = np.pad(v, 1, mode="edge")
-        dT = [
-            np.einsum("ab...,b...->a...", B, np.stack(at[1:]))
-            for B, at in zip(self.B, _faces(p, self.cell), strict=True)
-        ]
-        dD = self._differences(dT)
-        trace = np.einsum("ab...,ba...->...", self.inverse, dD)
-        return trace + np.einsum("a...,a...->...", self.slope, self._center(dT))
+        (across_x, across_y), (dx, dy) = _slopes(p, self.cell), self.cell
+        result = np.zeros_like(v)
+        for a in (0, 1):  # the component of dT
+            x, y = (B[a, 0] * gx + B[a, 1] * gy for B, (gx, gy) in zip(self.B, (across_x, across_y), strict=True))
+            left, right, bottom, top = x[:, :-1], x[:, 1:], y[:-1], y[1:]
+            result += self.inverse[0, a] / dx * (right - left) + self.inverse[1, a] / dy * (top - bottom)
+            result += self.slope[a] / 4 * (left + right + bottom + top)
+        return result
 
     def step(self, accuracy: float) -> Array:
         """Return the Newton step v (ny, nx)."""
@@ -361,10 +369,12 @@ def _dim(mu: Array, fade: float, dim: float) -> Array:
 def _at_edges(state: _State, optics: Optics, target: tuple[float, float]) -> None:
     """Set the slopes at the edges so that light there goes to the picture's edges."""
     for _ in range(3):
-        at = _faces(_padded(state.h, state.slopes, state.cell), state.cell)
-        for axis, (place, of) in enumerate(zip(_face_places(state.h.shape, state.size), at, strict=True)):
+        p = _padded(state.h, state.slopes, state.cell)
+        for axis, place in enumerate(_face_places(state.h.shape, state.size)):
             for side, index in enumerate((0, -1)):
                 cut = (slice(None), index) if axis == 0 else (index, slice(None))
+                near = p[tuple(slice(None) if k is not index else slice(-3, None) if side else slice(3) for k in cut)]
+                of = _faces(near, state.cell)[axis]
                 edge_place, edge = (place[0][cut], place[1][cut]), (of[0][cut], of[1][cut], of[2][cut])
                 T = optics.hit(*edge_place, *edge)
                 B = _derivative(optics, edge_place, edge, T)

@@ -7,6 +7,7 @@ import pytest
 from lens.pictures import Gradient, sharp, smooth
 
 from reslrb_cli.lens import transport
+from reslrb_cli.lens.surface import Rays, Setting, _start
 from reslrb_cli.lens.transport import grid, least_floor, resized, solve, splat, through_tent
 
 SIZE = (2.0, 1.0)
@@ -48,15 +49,24 @@ def test_a_round_aperture_fills_the_picture() -> None:
     assert made.error < 0.03
 
 
-def test_the_derivative_of_the_equation_matches_differences() -> None:
-    size, target = (1.0, 1.0), (1.0, 1.0)
-    x, y = grid((24, 24), size)
-    h, slopes = transport._even(even(size, target), (24, 24), size)
-    h = h + 4e-3 * np.cos(2 * np.pi * (x + 0.5)) * np.cos(np.pi * (y + 0.5))
-    v = np.cos(np.pi * (x + 0.5)) * np.cos(2 * np.pi * (y + 0.5))
-    optics, nu = Gradient(np.ones((2, 2)), size), smooth(96)
+MIRROR = Setting("mirror", (1.2, 1.0), distance=3.0, picture_size=(1.5, 1.0), incidence=30.0, tilt=(20, 10))
+
+
+@pytest.mark.parametrize(
+    ("optics", "start"),
+    [(Gradient(np.ones((2, 2)), (1.2, 1.0)), even((1.2, 1.0), (1.5, 1.0))), (Rays(MIRROR), _start(Rays(MIRROR)))],
+    ids=["gradient", "mirror"],
+)
+def test_the_derivative_of_the_equation_matches_differences(optics: transport.Optics, start: np.ndarray) -> None:
+    size, target = MIRROR.size, MIRROR.picture_size
+    x, y = grid((24, 30), size)
+    h, slopes = transport._even(start, (24, 30), size)
+    deep = 4e-3 if isinstance(optics, Gradient) else 1e-3
+    h = h + deep * np.cos(2 * np.pi * (x / size[0] + 0.5)) * np.cos(np.pi * (y + 0.5))
+    v = np.cos(np.pi * (x / size[0] + 0.5)) * np.cos(2 * np.pi * (y + 0.5))
+    nu = smooth(96)[:80]
     made = [
-        transport._Equation(transport._State(h + e * v, slopes, size, even(size, target)), optics, nu, target)
+        transport._Equation(transport._State(h + e * v, slopes, size, start), optics, nu, target)
         for e in (-1e-5, 0.0, 1e-5)
     ]
     made[1].linearize()
