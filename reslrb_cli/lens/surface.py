@@ -220,12 +220,13 @@ def shape_surface(
     longer = max(setting.size)
     shape = (max(8, round(cells * setting.size[1] / longer)), max(8, round(cells * setting.size[0] / longer)))
 
-    def solved(floor: float) -> transport.Transport:
+    def solved(floor: float, sharp: bool = False) -> transport.Transport:
         lifted = transport.lifted(target, floor)
-        return transport.solve(rays, lifted, setting.size, setting.picture_size, shape, start, tell)
+        return transport.solve(rays, lifted, setting.size, setting.picture_size, shape, start, tell, sharp)
 
-    made = solved(floor)
-    if chosen and floor < transport.FOR_LINES and made.residual > transport.UNSOLVED:
+    raises = chosen and floor < transport.FOR_LINES
+    made = solved(floor, raises)
+    if raises and (made.h.shape != shape or made.residual > transport.UNSOLVED):
         floor = transport.FOR_LINES  # of dark lines that are too fine for the trials' grid
         made = solved(floor)
     target = transport.lifted(target, floor)

@@ -147,6 +147,7 @@ def solve(
     shape: tuple[int, int],
     start: Array,
     tell: Callable[[str], None] = lambda stage: None,
+    sharp: bool = False,
 ) -> Transport:
     """Solve (1) from the coarsest grid up to `shape`.
 
@@ -157,7 +158,9 @@ def solve(
         evenly to the picture.
     - `tell` receives the name of each stage.
 
-    If the solver finds no solution for a sharp picture, it starts with a blurred picture.
+    If the solver finds no solution for a sharp picture, it starts with a blurred picture. If `sharp` is true, and the
+    grid before the last one has a solution only for a blurred picture, the function returns that solution, which has
+    not converged. The last grid has finer lines and takes most of the time.
     """
     levels = [shape]
     while min(levels[-1]) >= 2 * COARSEST:
@@ -173,17 +176,23 @@ def solve(
                 _newton(state, optics, nu, target, contrast)
         before = _copied(state)
         _newton(state, optics, nu, target)
+        blurred = False
         if state.residual > GOOD:  # steps end at the picture's edges, so start with a picture without edges
             steps, state = state.steps, before
             for width in BLURS:
                 trial = _copied(state)
                 _newton(trial, optics, nu, target, blur=width)
-                if trial.residual > GOOD and state.residual < GOOD:
+                blurred = trial.residual > GOOD and state.residual < GOOD
+                if blurred:
                     break
                 state = trial
             state.steps += steps
+        if sharp and blurred and n == levels[1]:
+            break
     assert state is not None
-    return _told(state, optics, picture / picture.mean(), target)
+    made = _told(state, optics, picture / picture.mean(), target)
+    made.converged = made.converged and made.h.shape == shape
+    return made
 
 
 # ---- one grid

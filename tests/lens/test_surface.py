@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from lens.pictures import Gradient, smooth
+from lens.pictures import Gradient, sharp, smooth
 from lens.tracer import bent, caustic
 from skimage.metrics import structural_similarity
 from turns import a_few
@@ -130,3 +130,18 @@ def test_empty_pictures_are_refused(picture: np.ndarray) -> None:
     with pytest.raises(ConfigError) as raised:
         shape_surface(picture, LENS)
     assert raised.value.key == "picture"
+
+
+def test_lines_that_are_too_fine_for_a_floor_end_before_the_last_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last grid takes most of the time, and would fail, too."""
+    monkeypatch.setattr(transport, "least_floor", lambda *_: 0.01)
+    stages: list[str] = []
+    made = shape_surface(sharp(64), Setting(), 48, tell=stages.append)
+    assert made.floor == transport.FOR_LINES
+    assert made.heights.shape == (48, 48)
+    assert stages.count("grid of 24x24") == 2
+    assert stages.count("grid of 48x48") == 1
+    stages.clear()
+    monkeypatch.setattr(transport, "least_floor", lambda *_: 0.1)
+    np.testing.assert_array_equal(shape_surface(sharp(64), Setting(), 48, tell=stages.append).heights, made.heights)
+    assert stages.count("grid of 24x24") == 1
