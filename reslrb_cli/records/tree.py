@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -77,8 +78,14 @@ def entries(*trees: Any) -> tuple[dict[str, Array], dict[str, Any]]:
             leaves = _leaves(each.metadata[_ENTRY], getattr(tree, each.name))
             found |= {place: to_array(leaf) for place, leaf in leaves}
         beside = {each.name for each in fields(tree) if _ENTRY in each.metadata}
-        values |= TypeAdapter(type(tree)).dump_python(tree, mode="json", exclude=beside)
+        values |= _adapter(type(tree)).dump_python(tree, mode="json", exclude=beside)
     return found, finite(values)
+
+
+@cache
+def _adapter(kind: type[T]) -> TypeAdapter[T]:
+    """Return the reader and writer of a class. Pydantic needs milliseconds to make one."""
+    return TypeAdapter(kind)
 
 
 def _array_fields(tree: Any) -> list[Field[Any]]:
@@ -114,7 +121,7 @@ class Stored:
         names = [each.name for each in fields(kind) if _ENTRY not in each.metadata]  # type: ignore[arg-type]
         plain = {name: self._values[name] for name in names if name in self._values}
         try:  # as JSON, because strict validation of Python values rejects a mapping for a dataclass
-            return TypeAdapter(kind).validate_json(json.dumps(plain), strict=True)
+            return _adapter(kind).validate_json(json.dumps(plain), strict=True)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             raise self.wrong(".".join(map(str, first["loc"])), first["msg"]) from None

@@ -469,7 +469,8 @@ def test_a_run_is_in_only_one_loop(experiment: Path) -> None:
     assert next(iter(run)).iteration == 1
 
 
-def test_errors_are_located(experiment: Path) -> None:
+def test_errors_are_located(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FolderLock.__init__, "__defaults__", (0.05, False))  # waits for a shorter time
     cases: list[tuple[Callable[[], Any], str]] = [
         (lambda: rl.optimize(), "experiment: is missing; give a configuration, or resume=RUN"),
         (lambda: rl.optimize("tiny.yaml", folder="scene.xml/runs"), f"folder: {experiment}/scene.xml is not"),

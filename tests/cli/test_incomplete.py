@@ -232,6 +232,7 @@ def test_an_interrupt_stops_a_script_during_the_measurement(experiment: Path, mo
     assert not (experiment.parent / "stopped").exists()
 
 
+@pytest.mark.long
 def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path):
     """The light of a spot lamp falls off smoothly and passes through glass. The derivative contains the whole
     caustic.
@@ -251,9 +252,13 @@ def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path
 def test_a_short_measurement_finds_the_derivative_of_a_lens_complete(llvm: str):
     """The light of the lens has no edges, and its caustic bends within the longest step."""
     path, sets = Path(__file__).parents[2] / "configs/lens_pose.yaml", ["target.render.spp=64"]
-    found = measure_missing(assemble(load(path, sets)))
+    problem = assemble(load(path, sets))
+    values = {key: value.copy() for key, value in problem.values().items()}
+    found = measure_missing(problem)
     assert len(found) == 2
     assert not any(each.is_incomplete for each in found), [each.line() for each in found]
+    assert all(np.array_equal(value, values[key]) for key, value in problem.values().items())
+    assert not any(np.any(np.array(gradient)) for gradient in problem.gradients().values())
 
 
 def test_shares_have_standard_errors():

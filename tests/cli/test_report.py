@@ -103,12 +103,12 @@ def optimize(llvm, tmp_path, monkeypatch):
 
 
 def test_writing_the_page_is_not_timed(optimize, monkeypatch):
-    """Writing the page takes 0.2 s, at the start, after each iteration and at the end."""
+    """Writing the page takes 0.1 s, at the start, after each iteration and at the end."""
     written = []
 
     def slowly(folder, *now):
         written.append(now)
-        time.sleep(0.2)
+        time.sleep(0.1)
 
     monkeypatch.setattr(recording, "write_report", slowly)
     optimize("--set", "run.iterations=6")

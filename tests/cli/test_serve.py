@@ -352,7 +352,7 @@ def test_the_command(llvm, tmp_path, monkeypatch):
 
 def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
     """Links lead to the pages and back, nothing is blocked, and a list that reloads keeps its place."""
-    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 1)
+    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 0.4)
     for number in range(30):
         make_run(runs / f"more-{number}", iterations=1)
     address = f"http://127.0.0.1:{served}/"

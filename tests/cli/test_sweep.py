@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from reslrb_cli.cli import jobs, main, sweep
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.config.loader import dump, load
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.records.sweeps import (
@@ -382,6 +383,7 @@ def test_ctrl_c_ends_it_after_the_iteration_with_complete_folders(folder, monkey
 
 
 def test_a_sweep_locks_its_folder(folder, monkeypatch):
+    monkeypatch.setattr(FolderLock.__init__, "__defaults__", (0.05, False))  # waits for a shorter time
     said = []
 
     def another(arguments, interrupts, slot, fresh=False):
@@ -445,6 +447,7 @@ def test_a_run_in_use_is_waited_for(folder, monkeypatch):
     manifest = json.loads(Path("s/seed=0/manifest.json").read_text())
     Path("s/seed=0/manifest.json").write_text(json.dumps(manifest | {"status": "running"}))
     monkeypatch.setattr(plans, "RELEASE_SECONDS", 0.1)
+    monkeypatch.setattr(FolderLock.__init__, "__defaults__", (0.05, False))
     with FolderLock(Path("s/seed=0")):
         result = reslrb("sweep", "--resume", "s")
     assert (result.exit_code, result.output.splitlines()[-1]) == (
@@ -452,6 +455,21 @@ def test_a_run_in_use_is_waited_for(folder, monkeypatch):
     assert "finished, 1 of 1 runs done" in tiny.done("sweep", "--resume", "s").output
 
 
+def test_a_run_ends_when_the_input_from_its_sweep_closes(monkeypatch):
+    """The end of the sweep's process closes the input."""
+    waiting = "import reslrb_cli.cli as cli, time; cli.run = lambda: [print('1/5: x', flush=True), time.sleep(60)]; "
+    monkeypatch.setattr(jobs, "_PROGRAM", waiting + jobs._PROGRAM)
+    slot, ends = jobs.RunSlot(), []
+    with Interrupts() as interrupts:
+        sweep_of_it = threading.Thread(target=lambda: ends.append(jobs.call([], interrupts, slot)))
+        sweep_of_it.start()
+        wait_for(lambda: slot.line != "")
+        slot.process.stdin.close()
+        sweep_of_it.join(20)
+    assert ends == [(ExitCode.INTERRUPTED, "1/5: x")]
+
+
+@pytest.mark.long
 def test_a_run_ends_with_its_killed_sweep(llvm, tmp_path):
     tiny.write_experiment(tmp_path)
     settings = tiny.settings(*QUICK, "run.iterations=100000")

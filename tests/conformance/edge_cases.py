@@ -445,7 +445,7 @@ RECORDED = [
     EdgeCase("shaded", "point", step=SMALLEST, reference_spp=8192),
     EdgeCase("bumpy", "area", motion=HEIGHTS, spp=512, reference_spp=8192, step=SMALLER),
     *(EdgeCase("box", lamp, lamp_moves=True, spp=1024) for lamp in ("area", "spot")),
-    EdgeCase("none", "room", 3, lamp_moves=True, spp=1024),
+    EdgeCase("none", "room", 3, lamp_moves=True, spp=512),
     EdgeCase("reflected", "area", 3, spp=512, reference_spp=8192, options=BOTH),
     EdgeCase("mirror", "constant", 3, reference_spp=8192, options=BOTH),
     EdgeCase("glazed", "area", 4, ("x", "z"), spp=1280, reference_spp=8192, options=LIGHT),

@@ -98,6 +98,7 @@ SIMILAR = (
     "mirror-constant-3",
     "smooth-front-2",
     "square_0.3-paned-4",
+    "glazed-area-4",  # the comparison with and without a clear pane finds its fault
 )
 
 
@@ -184,7 +185,7 @@ FAULTS = [
           " + (shares[1] - shares[0])", ""),
     Fault("solid_angle_of_a_lamp_left_out", "sphere-near-2", "transport.edges:_from",
           "first.weight * solid", "first.weight"),
-    Fault("light_through_glass_counted_twice", "glazed-area-4", "estimators.edges:_from_sensor",
+    Fault("light_through_glass_counted_twice", "clear_pane", "estimators.edges:_from_sensor",
           "excludes=excludes", "excludes=False"),
     Fault("edges_in_glass_left_out", "slab-area-4", "estimators.chain_edges:has_edges_behind_chains",
           "bool(plan.needs.has_delta_lobes)", "not plan.camera"),
@@ -324,7 +325,7 @@ def check_contact(monkeypatch: pytest.MonkeyPatch) -> None:
     the light between the box and the floor, so that a fault of their edges shows.
     """
     monkeypatch.setattr(context, "NEAR", 1.0)
-    case = BY_NAME["standing-room-3"]
+    case = replace(BY_NAME["standing-room-3"], spp=512)
     agreement = check(case, recorded(case))
     assert agreement, agreement
 

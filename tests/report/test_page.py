@@ -453,7 +453,7 @@ def test_a_page_in_progress_keeps_the_reader_s_place(chromium, tmp_path, monkeyp
     chromium.evaluate("document.querySelector('.compare input').value = 30")
     chromium.evaluate("document.querySelector('.compare input').dispatchEvent(new Event('input'))")
     chromium.evaluate("window.seen = 1; document.querySelector('.stage').click()")
-    time.sleep(2.5)
+    time.sleep(1.3)
     assert chromium.evaluate("[window.seen, document.querySelectorAll('dialog').length]") == [1, 1]
     chromium.evaluate("document.querySelector('dialog').click()")
     assert chromium.wait_for("window.seen != 1 && document.readyState == 'complete'", 10)
@@ -471,7 +471,7 @@ def test_only_a_reliable_result_is_green(chromium, pages, tmp_path):
 
 
 def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_path, monkeypatch):
-    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 1)
+    monkeypatch.setattr(page_module, "REFRESH_SECONDS", 0.5)
     folder = make_run(tmp_path / "run", iterations=3, truth=False)
     path = write_report(folder, read_manifest(folder) | {"status": "running"}, {})
     chromium.open(path, 1400)
@@ -479,7 +479,7 @@ def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_pa
     write_report(folder)
     assert chromium.wait_for("document.querySelector('.status')?.textContent == 'finished'", 10)
     chromium.events.clear()
-    assert not chromium.wait_for("false", 2)
+    assert not chromium.wait_for("false", 1)
     assert chromium.requests() == []
 
 

@@ -265,7 +265,10 @@ def test_a_missing_run_is_reported(tmp_path: Path, run: Path, capsys: pytest.Cap
 
 
 @pytest.mark.skipif(os.name != "posix", reason="no locks")
-def test_a_running_run_is_left_alone(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_running_run_is_left_alone(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FolderLock.__init__, "__defaults__", (0.05, False))  # waits for a shorter time
     with FolderLock(run):
         assert "is in use by a run (a loop of this process; leave it" in told(capsys, run)
     process = subprocess.Popen(["sleep", "60"])
