@@ -78,7 +78,8 @@ def entries(*trees: Any) -> tuple[dict[str, Array], dict[str, Any]]:
             leaves = _leaves(each.metadata[_ENTRY], getattr(tree, each.name))
             found |= {place: to_array(leaf) for place, leaf in leaves}
         beside = {each.name for each in fields(tree) if _ENTRY in each.metadata}
-        values |= _adapter(type(tree)).dump_python(tree, mode="json", exclude=beside)
+        adapter = _adapter(type(tree))  # type: ignore[arg-type]  # types are hashable
+        values |= adapter.dump_python(tree, mode="json", exclude=beside)
     return found, finite(values)
 
 
@@ -121,7 +122,7 @@ class Stored:
         names = [each.name for each in fields(kind) if _ENTRY not in each.metadata]  # type: ignore[arg-type]
         plain = {name: self._values[name] for name in names if name in self._values}
         try:  # as JSON, because strict validation of Python values rejects a mapping for a dataclass
-            return _adapter(kind).validate_json(json.dumps(plain), strict=True)
+            return _adapter(kind).validate_json(json.dumps(plain), strict=True)  # type: ignore[arg-type]
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             raise self.wrong(".".join(map(str, first["loc"])), first["msg"]) from None

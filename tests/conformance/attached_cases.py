@@ -172,7 +172,7 @@ BACK = "estimators.attached:AttachedFrame.differentiate"
 FAULTS = [
     # ---- The walk back: naive AD of our walk is right ----
     Fault("sign_of_adjoint_of_origin", "slab", BACK,
-                  "(mi.Vector3f(dr.grad(ray.o)),", "(-mi.Vector3f(dr.grad(ray.o)),", quick=True),
+                  "(mi.Vector3f(dr.grad(ray.o)),", "(-mi.Vector3f(dr.grad(ray.o)),"),
     Fault("direction_has_no_adjoint", "slab", BACK, " + dr.dot(following.d, adjoint.direction)", ""),
     Fault("prefix_missing", "bounces", BACK, "dr.dot(P, reached * (own + later))",
                   "dr.sum(reached * (own + later))"),
@@ -204,7 +204,7 @@ FAULTS = [
                   stock=True),
     Fault("shading_normals_detached", "slab", "transport.connection:shading_correction",
                   "dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n))",
-                  "dr.detach(dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)))", stock=True, quick=True),
+                  "dr.detach(dr.abs((cos_i * wo_dot_n) / (cos_o * wi_dot_n)))", stock=True),
     Fault("importance_detached", "slab", "transport.connection:connect",
                   "Connection(importance * correction", "Connection(dr.detach(importance) * correction", stock=True),
     Fault("density_of_rough_glass_detached", "rough_slab", "transport.bsdf:scatter",

@@ -212,8 +212,7 @@ def test_classes_contain_all_light_once():
 
 
 CLASS_FAULTS = [
-    Fault("light_paths_have_all_light", "", "transport.walk:walk", "connected &= begins | (path.depth > 1)", "pass",
-          quick=True),
+    Fault("light_paths_have_all_light", "", "transport.walk:walk", "connected &= begins | (path.depth > 1)", "pass"),
     Fault("camera_paths_hit_all_light", "", "transport.camera:_meet", "active &= ~own_class.excludes_hit()", "pass"),
     Fault("metal_counts_twice", "", "transport.camera:camera_walk",
           "~((own_class.before != 0) & begins_caustic(bsdf, False))", "True"),

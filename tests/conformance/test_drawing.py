@@ -184,23 +184,22 @@ def _with_share(found: Any) -> Any:
     return replace(aimed, share=0 * aimed.share + aim.SHARE), numbers
 
 
-#: Each fault: its way, a case that shows it, the number of seeds, and whether the default suite plants it.
-FAULTS: list[tuple[Callable[[pytest.MonkeyPatch], None], str, str, int, bool]] = [
-    (without_factor, "aimed", "roughplastic", 48, True),
-    (of_even_density, "aimed", "roughplastic", 48, True),
-    (behind_others, "aimed", "mesh_attribute", 96, False),
-    (seen_through_others, "aimed", "roughdielectric", 96, False),
-    (with_delta_lobes, "aimed", "plastic", 48, False),
-    (from_everywhere, "aimed", "glass", 48, False),
-    *((fault, "guided", "two_emitters", 32, False) for fault in GUIDING_FAULTS),
+#: Each fault: its way, a case that shows it, and the number of seeds.
+FAULTS: list[tuple[Callable[[pytest.MonkeyPatch], None], str, str, int]] = [
+    (without_factor, "aimed", "roughplastic", 48),
+    (of_even_density, "aimed", "roughplastic", 48),
+    (behind_others, "aimed", "mesh_attribute", 96),
+    (seen_through_others, "aimed", "roughdielectric", 96),
+    (with_delta_lobes, "aimed", "plastic", 48),
+    (from_everywhere, "aimed", "glass", 48),
+    *((fault, "guided", "two_emitters", 32) for fault in GUIDING_FAULTS),
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("fault", "way", "case", "count"),
-    [pytest.param(*row, id=f"{row[1]}-{row[0].__name__}", marks=() if quick else pytest.mark.long)
-     for *row, quick in FAULTS],
-)  # fmt: skip
+    ("fault", "way", "case", "count"), [pytest.param(*row, id=f"{row[1]}-{row[0].__name__}") for row in FAULTS]
+)
 def test_planted_biases_are_found(
     fault: Callable[[pytest.MonkeyPatch], None], way: str, case: str, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -237,7 +236,7 @@ REPLAYS: dict[str, tuple[Any, tuple[str, ...], tuple[str, ...], Callable[[pytest
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", [False, True])
+@pytest.mark.parametrize("fault", [False, pytest.param(True, marks=pytest.mark.long)])
 @pytest.mark.parametrize(
     ("way", "name"),
     pairs({way: few for way, (_, _, few, _) in REPLAYS.items()}, {way: all for way, (_, all, _, _) in REPLAYS.items()}),

@@ -149,7 +149,8 @@ def masked(bsdf: dict, opacity: float) -> dict:
 
 
 @pytest.mark.parametrize(
-    ("bsdf", "expected"), [thin_glass(1.3), thin_glass(2.5), masked_plastic(0.6), masked_glass(0.6)]
+    ("bsdf", "expected"),
+    [thin_glass(1.3), pytest.param(*thin_glass(2.5), marks=pytest.mark.long), masked_plastic(0.6), masked_glass(0.6)],
 )
 def test_singular_lobes_in_closed_form(bsdf: dict, expected: dict[str, float]) -> None:
     """The surface lies before a sky of radiance 1."""
@@ -232,6 +233,7 @@ def test_the_jump_of_ggx_glass(distribution: str, is_right: bool) -> None:
     assert (found == pytest.approx((up - down) / 0.04, rel=0.02)) == is_right
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", [0.0, 0.9])
 def test_a_wrong_derivative_is_found(fault: float, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)

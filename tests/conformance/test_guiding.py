@@ -49,7 +49,7 @@ def test_renders_of_a_script_learn_from_each_other() -> None:
         mi.load_dict({"type": "reslrb", "guiding": "maybe"})
 
 
-@pytest.mark.parametrize("fault", [None, *FAULTS])
+@pytest.mark.parametrize("fault", [None, *(pytest.param(one, marks=pytest.mark.long) for one in FAULTS)])
 def test_samples_are_stratified_by_weight(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With any table, weighted means of functions of the numbers equal the means of uniform numbers. The test detects
     every planted fault.

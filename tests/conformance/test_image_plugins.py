@@ -162,12 +162,12 @@ BSDFS = [
 ]  # fmt: skip
 #: The default suite. A ball refracts light in and out again, which can hide a fault of one of the two, so that glass is
 #: a sheet here, and a ball in test_image_paths.py (shading normals, roulette). Of the BSDFs that throw light on the
-#: floor, it takes glass, and one normal map.
+#: floor, it takes a normal map of glass.
 #: The other BSDFs have `ptracer` as their reference, or their parts are listed here.
 FEW = (
     *(f"ball of {name}" for name in ("mask", "bumpmap")),
-    *(f"sheet of {name}" for name in ("roughdielectric", "principledthin", "mask of glass")),
-    *(f"light of {name}" for name in ("dielectric", "normalmap of dielectric")),
+    *(f"sheet of {name}" for name in ("roughdielectric", "principledthin")),
+    "light of normalmap of dielectric",
     "thin glass before the sensor",
 )  # fmt: skip
 #: The BSDFs that the default suite compares with `ptracer` alone.
@@ -271,7 +271,8 @@ LIT = [
 #: test_camera_paths.py a sphere.
 SIMILAR = ("area", "visible area", "sphere", "point", "spot", "textured spot", "projector", "sunsky", "envmap",
            "envmap, one axis", "hidden envmap", "hidden envmap, one axis", "hidden envmap, two axes",
-           "hidden sunsky", "hidden sunsky, turned", "several with a constant", "several with a map")  # fmt: skip
+           "hidden sunsky", "hidden sunsky, turned", "several with a constant", "several with a map",
+           "sunsky, turned", "area with mask", "constant")  # fmt: skip
 
 
 @pytest.mark.usefixtures("samples")

@@ -243,8 +243,7 @@ def test_refused_with_a_reason(name: str):
 
 
 FAULTS = [
-    Fault("area_of_faces_detached", "mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)",
-          quick=True),
+    Fault("area_of_faces_detached", "mesh", "transport.lamps:lamp_point", "area / dr.detach(area)", "mi.Float(1)"),
     Fault("start_does_not_move", "parallel", "estimators.attached:differentiate_start", "if plan.moving_emission:",
           "if False:"),
     Fault("normal_of_sphere_as_mitsuba_has_it", "turned", "transport.lamps:lamp_point", "if lamp.is_sphere:",

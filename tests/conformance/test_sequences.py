@@ -45,6 +45,7 @@ def test_numbers_are_evenly_distributed(guiding: str) -> None:
     assert result
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "fault",
     [

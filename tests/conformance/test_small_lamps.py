@@ -191,12 +191,12 @@ def test_radiance_counts_once_if_its_lamp_moves_too(size: float):
 SPLAT = "transport.lamp_light:small_points"
 FAULTS = [
     Fault("left_out", "third", "transport.emission:splat_visible_emission", "if samples.plan.small_lamps",
-          "if False", frozenset({("stack", "ptracer")}), quick=True),
+          "if False", frozenset({("stack", "ptracer")})),
     Fault("not_differentiated", "third", "transport.emission:differentiate_visible_emission",
           "plan.small_lamps and plan", "False and plan", frozenset({("stack", "walk_ad"), ("stack", "analytic")})),
     Fault("primary_rays_find_them_too", "third", "transport.emission:_radiance",
           "emitter != mi.EmitterPtr(lamp.emitter)", "mi.Bool(True)",
-          frozenset({("stack", "analytic"), ("stack", "ptracer")}), quick=True),
+          frozenset({("stack", "analytic"), ("stack", "ptracer")})),
     Fault("cosine_forgotten", "two", "transport.lamp_light:_points", "cos * weight", "weight",
           frozenset({("stack", "ptracer")})),
     Fault("turns_not_counted", "two", SPLAT, "(mi.Float(count) / mi.Float(lanes))", "1",

@@ -71,7 +71,7 @@ def drawn(shape: str, side: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("shape", "side", "mode", "pixels"),
     [
-        ("logo", 400, "L", 128),
+        pytest.param("logo", 400, "L", 128, marks=pytest.mark.long),
         pytest.param("inverse", 500, "P", 33, marks=pytest.mark.long),
         ("pixel", 150, "L", 50),
         ("logo", 16, "I;16", 32),

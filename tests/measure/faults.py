@@ -125,7 +125,7 @@ class Fault:
 
     `fails` are pairs of an estimator and a reference. In an image's record, the estimator is None. Estimators that are
     not in `fails` do not have the fault, and their records hold. With `stock`, naive AD of our walk shares the fault,
-    so that only `ptracer` can find it. The default suite plants faults that are `quick`.
+    so that only `ptracer` can find it.
     """
 
     name: str
@@ -135,13 +135,11 @@ class Fault:
     wrong: str
     fails: frozenset[tuple[str | None, str]] = frozenset()
     stock: bool = False
-    quick: bool = False
 
 
 def planted(faults: Iterable[Fault]) -> pytest.MarkDecorator:
-    """Parametrise a test with faults. All but the quick faults need `-m long`."""
-    marked = [pytest.param(fault, id=fault.name, marks=() if fault.quick else pytest.mark.long) for fault in faults]
-    return pytest.mark.parametrize("fault", marked)
+    """Parametrise a test with faults. It needs `-m long`, because it tests another test."""
+    return pytest.mark.parametrize("fault", [pytest.param(one, id=one.name, marks=pytest.mark.long) for one in faults])
 
 
 def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,7 +201,7 @@ FAULTS = [
     Fault("black_texels_not_drawn", "black_texels_of_lamp", "integrators.context:Preparation.plan",
           "lamp.texture in which.emission_nodes", "False", by("stack", "analytic")),
     Fault("black_lamp_drawn_as_others", "black_lamp", "transport.lamps:_any_uv",
-          "dr.select(even | black, sample, uv)", "dr.select(even, sample, uv)", by("stack", "analytic"), quick=True),
+          "dr.select(even | black, sample, uv)", "dr.select(even, sample, uv)", by("stack", "analytic")),
     # ---- Adjoints and derivatives: paths are right, and naive AD of them is a reference ----
     Fault("adjoint_without_filter", "wide_filter", "transport.film:AdjointImage.lookup",
           "self.film.film.rfilter().is_box_filter()", "True", by("gather stack", "walk_ad", "ptracer")),

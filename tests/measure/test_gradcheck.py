@@ -434,6 +434,7 @@ def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
     assert record_of(GradcheckRecord, old | {"integrator": "reslrb", "estimator": "stack"}).label == "reslrb:stack"
 
 
+@pytest.mark.long
 def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch):
     """Beside camera paths, light paths keep their full weight. Naive AD has the same fault, but `path` does not."""
     monkeypatch.setattr("reslrb_cli.transport.walk.weight_of_connection", lambda *_: mi.Float(1))

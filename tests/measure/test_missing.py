@@ -133,6 +133,7 @@ def test_known_shares(scene: Callable[[], SceneCase], known: float, count: int):
     assert abs(found - known) < 4 * error + 1e-9
 
 
+@pytest.mark.long
 def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
     """The check finds a gradient that also lacks the light's shift to other positions."""
     right = AdjointImage.lookup

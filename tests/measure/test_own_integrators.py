@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from cli.tiny import ended
 from kit import area, diffuse, scene, sensor, shape
-from turns import a_few
 
 from reslrb_cli.errors import ExitCode
 
@@ -77,18 +76,13 @@ def test_a_correct_integrator_holds() -> None:
 #: Faults that `own_replay.py` plants.
 FAULTS = ("fault=cosine", "fault=replay", "fault=roulette", "fault=lobe", "fault=kept", "fault=emitters", "fault=twice",
           "fault=first", "fault=sign", "fault=depth", "primal_fault=emitters")  # fmt: skip
-#: Faults that the default suite looks for, with the shortest maximal depth that shows each fault. The others need a
-#: floor of two materials.
-QUICK = {"fault=cosine": 3}
 
 
-@pytest.mark.parametrize("fault", a_few(FAULTS, QUICK))
+@pytest.mark.long
+@pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_found(fault: str) -> None:
     more = ["--set", TWO] if fault == "fault=lobe" else []
-    if fault in QUICK:
-        more = [*FEW, "--seeds", "8", "--spp", "16", "--set", f"integrator.max_depth={QUICK[fault]}"]
-    else:
-        Path("scene.xml").write_text(room(MIXED))
+    Path("scene.xml").write_text(room(MIXED))
     assert checked(fault, *more) == ExitCode.CHECK_FAILED
 
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 from agreement import blocks, compare
+from turns import taking_turns
 
 from reslrb_cli.measure.comparison import (
     TAIL_SEEDS,
@@ -63,8 +64,7 @@ DISTRIBUTIONS = {
 }
 
 
-@pytest.mark.parametrize("kind", DISTRIBUTIONS)
-@pytest.mark.parametrize("paired", [True, False])
+@taking_turns("kind", [*DISTRIBUTIONS], "paired", [True, False])
 def test_equal_expectations_seldom_fail(kind, paired):
     """Some entries have no noise. A row of a correct table fails with a probability of at most 1e-3, for any number of
     seeds.
@@ -81,8 +81,7 @@ def test_equal_expectations_seldom_fail(kind, paired):
     assert failed <= 2  # of 500; at 1e-3, three have a probability of 0.014
 
 
-@pytest.mark.parametrize("count", [8, 16, 64])
-@pytest.mark.parametrize("paired", [True, False])
+@taking_turns("count", [8, 16, 64], "paired", [True, False])
 def test_the_detectable_deviation_is_detected(count, paired):
     """One entry. Where several entries deviate, more deviations are detected."""
     random = np.random.default_rng(5)

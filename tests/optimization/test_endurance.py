@@ -97,6 +97,7 @@ def test_the_loop_does_not_grow(toy: Any) -> None:
     assert [fault for fault in growth(loop.optimize(toy.problem), BLOCK) if not fault.startswith("steps")] == []
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_leak_is_found(toy: Any) -> None:
     kept = []
@@ -110,6 +111,7 @@ def test_a_leak_is_found(toy: Any) -> None:
     assert any(fault.startswith("the allocator's peak: ") for fault in found), found
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_leak_outside_the_allocator_is_found(toy: Any) -> None:
     kept = []
@@ -123,6 +125,7 @@ def test_a_leak_outside_the_allocator_is_found(toy: Any) -> None:
     assert fault.startswith("memory: ")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_slowdown_is_found(toy: Any) -> None:
     def slow(call: int) -> float:

@@ -190,6 +190,7 @@ def test_learning_paths_are_not_used_for_the_decision(experiment: Path, monkeypa
     assert not learned & judged
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("llvm")
 @pytest.mark.parametrize("fault", ["seeds", "held"])
 def test_faults_of_the_decision_are_found(fault: str, experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,8 +258,7 @@ def test_a_damaged_decision_is_measured_again(experiment: Path, monkeypatch: pyt
 
 
 @pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("is_open", [True, False])
-@pytest.mark.parametrize("setting", ["guiding", "paths"])
+@taking_turns("setting", ["guiding", "paths"], "is_open", [True, False])
 def test_only_a_decided_race_is_kept(
     setting: str, is_open: bool, experiment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -375,6 +375,7 @@ def test_it_is_rarely_on_if_it_does_not_pay() -> None:
     assert on_by_accident(**world, entries=3) <= 9
 
 
+@pytest.mark.long
 def test_a_decision_by_the_gain_alone_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lower end of the interval is replaced by the gain itself."""
     right = Turns._gain
@@ -387,6 +388,7 @@ def test_a_decision_by_the_gain_alone_is_found(monkeypatch: pytest.MonkeyPatch) 
     assert on_by_accident(variance=0.8, walk=0.7, python=16.8) > 30
 
 
+@pytest.mark.long
 def test_a_decision_without_the_cost_of_learning_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the cost of learning, guiding is enabled in most worlds where it gains nothing."""
     monkeypatch.setattr(Turns, "_learning_ms", lambda self: 0.0)

@@ -98,6 +98,7 @@ def test_gradients_are_unbiased(folder, way):
     assert found, found
 
 
+@pytest.mark.long
 def test_a_single_set_of_samples_would_be_found(folder):
     """The comparison of `test_gradients_are_unbiased` has enough power to detect the bias of a single set."""
     reference = independent(make(folder, "run.adjoint=independent"))

@@ -74,7 +74,7 @@ def assert_same(found: dict[str, Any], expected: dict[str, Any]) -> None:
 RENDERED = ("cornell_floor", "grey_room", "caustic_heightmap")
 
 #: Scenes with nothing that the other scenes lack. Their textures take seconds.
-SIMILAR = ("lens_pose", "caustic_slab", "caustic_heightmap")
+SIMILAR = ("lens_pose", "caustic_slab", "caustic_heightmap", "prism")
 
 
 @pytest.mark.parametrize(
