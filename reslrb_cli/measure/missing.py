@@ -105,16 +105,17 @@ class Tracing:
         case = self.cases[0]
         return {key: case.initial[key] + s * vector[at] for key, at in case.places.items()}
 
-    def segment(self, direction: Direction, trials: int = 4) -> LineSegment:
+    def segment(self, direction: Direction, trials: int = 4, step: float = LONGEST) -> LineSegment:
         """Return a segment without weights. Up to `trials` lengths are tried, until the image changes by about `AIM`
-        along the segment.
+        along the segment. The first trial ends at `step`.
         """
-        step, back = LONGEST, 1.0 if direction.sides == "both" else 0.0
+        back = 1.0 if direction.sides == "both" else 0.0
         for _ in range(trials):
             change = self._change(direction.vector, -back * step, step)
-            if change <= 2 * AIM or step == SHORTEST:
+            wanted = min(max(step * AIM / change, SHORTEST), LONGEST) if change else LONGEST
+            if step / 2 <= wanted <= 2 * step:
                 break
-            step = max(step * AIM / change, SHORTEST)
+            step = wanted
         return LineSegment(direction.vector, -back * step, step)
 
     def _change(self, vector: np.ndarray, low: float, high: float) -> float:
@@ -340,7 +341,8 @@ class MissingCheck:
         least, segments = 2 * self.image_spp * len(directions) + fewest * at_a_seed, list[LineSegment]()
         trials = next((count for count in range(4, 0, -1) if affords(least + count * trial)), 0)
         for direction in directions if trials else ():
-            segment = tracing.segment(direction, trials)
+            # Directions of one parameter have similar effects: the length of the last segment suits the next one.
+            segment = tracing.segment(direction, trials, segments[-1].high if segments else LONGEST)
             segments.append(tracing.weigh(segment, self.problem, self.views, self.image_spp))
         if not any(np.any(weights) for segment in segments for weights in segment.weights):
             return MissingRecord(self.source, key, None, None, len(directions), 0)

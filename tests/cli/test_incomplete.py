@@ -283,7 +283,7 @@ def simulated(
     random = np.random.default_rng(5)
 
     class Simulated(Tracing):
-        def segment(self, direction: Direction, trials: int = 4) -> LineSegment:
+        def segment(self, direction: Direction, trials: int = 4, step: float = 1.0) -> LineSegment:
             return LineSegment(direction.vector, -1, 1)
 
         def weigh(self, segment: LineSegment, *_: Any) -> LineSegment:
@@ -323,6 +323,26 @@ def test_all_looks_together_keep_the_probability_of_a_false_alarm():
         alarms |= np.abs(mean) > student(look, 1) * error
         look *= missing.GROWTH
     assert 0.2 * ALARM < alarms.mean() <= stats.binom.ppf(0.99, len(sums), ALARM) / len(sums)
+
+
+def test_the_length_of_a_segment_starts_from_that_of_the_last_one():
+    """A trial moves a mesh twice. Lengths shrink and grow until the image changes by about `AIM`."""
+    lengths: list[float] = []
+
+    class Along(Tracing):
+        def _change(self, vector: np.ndarray, low: float, high: float) -> float:
+            lengths.append(high)
+            return float(vector[0]) * (high - low)
+
+        def weigh(self, segment: LineSegment, *_: Any) -> LineSegment:
+            return replace(segment, weights=[np.zeros(1)])
+
+    check: Any = object.__new__(MissingCheck)
+    check.problem, check.views, check.source, check.image_spp = None, [], "a.yaml", 4
+    check.tracing = Along([], None, None, 1)
+    check.directions = lambda key: [Direction(np.array([size]), "both") for size in (3.0, 4.0, 0.5, 0.01, 0.0)]
+    check.measured("x", lambda more: True)
+    assert lengths == pytest.approx([0.1, 0.005, 0.005, 0.005, 0.03, 0.03, 0.1, 0.1])
 
 
 def test_weights_belong_to_the_end_with_the_higher_loss(llvm: str):
