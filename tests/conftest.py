@@ -92,8 +92,10 @@ def pytest_configure(config: pytest.Config) -> None:
     # Otherwise every process that tests start would compile the package anew, which takes half a second.
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     sys.dont_write_bytecode = False
-    if is_quick(config) and leave_out_optimisations():
-        show_fatal_errors(os.dup(2))  # before pytest captures it
+    if is_quick(config):
+        os.fsync = lambda descriptor: None  # files of tests need not survive a loss of power
+        if leave_out_optimisations():
+            show_fatal_errors(os.dup(2))  # before pytest captures it
 
 
 def tested_variant() -> str:

@@ -62,12 +62,16 @@ class Chromium:
     def open(self, path: Path | str, width: int, scripts: bool = True, dark: bool = False) -> None:
         """Open the page at a path or an address with a width in pixels, and wait until the page is fully loaded."""
         self._call("Emulation.setScriptExecutionDisabled", value=not scripts)
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self._call("Emulation.setEmulatedMedia", features=[scheme])
-        self._call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=True)
+        self.show(width, dark)
         self.events.clear()
         self._call("Page.navigate", url=path if isinstance(path, str) else path.absolute().as_uri())
         self._wait(lambda: any(event["method"] == "Page.loadEventFired" for event in self.events))
+
+    def show(self, width: int, dark: bool = False) -> None:
+        """Show the page with another width, in light or dark mode, without loading it again."""
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self._call("Emulation.setEmulatedMedia", features=[scheme])
+        self._call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=True)
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression in the page. Scripts of the page itself may be disabled."""

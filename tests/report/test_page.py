@@ -378,13 +378,14 @@ OUTSIDE = """[...document.querySelectorAll('body *')].filter(e => {
 }).map(e => e.tagName + ': ' + e.textContent.slice(0, 60))"""
 
 
-@pytest.mark.parametrize("width", [320, 750, 1400])
 @pytest.mark.parametrize("name", [*RUNS, EVERYTHING])
-def test_nothing_scrolls_sideways(chromium, pages, name, width):
-    chromium.open(pages[name], width)
-    assert chromium.evaluate("document.documentElement.scrollWidth") <= width
+def test_nothing_scrolls_sideways(chromium, pages, name):
+    chromium.open(pages[name], 320)
     assert chromium.evaluate("document.scripts.length") == 1  # markup in names has no effect
-    assert chromium.evaluate(OUTSIDE.replace("WIDTH", str(width))) == []
+    for width in (320, 750, 1400):
+        chromium.show(width)
+        assert chromium.evaluate("document.documentElement.scrollWidth") <= width
+        assert chromium.evaluate(OUTSIDE.replace("WIDTH", str(width))) == []
 
 
 def test_pictures_and_curves_work_without_script_and_network(chromium, pages):
@@ -483,8 +484,7 @@ def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_pa
     assert chromium.requests() == []
 
 
-@pytest.mark.parametrize("dark", [False, True])
-def test_text_has_contrast_with_its_background(chromium, pages, dark):
+def test_text_has_contrast_with_its_background(chromium, pages):
     """Every element with text of its own has at least WCAG's contrast of 4.5, in light and in dark mode."""
     contrast = """(() => {
         const level = c => c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4;
@@ -498,10 +498,12 @@ def test_text_has_contrast_with_its_background(chromium, pages, dark):
             return [(Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05), e.textContent.slice(0, 40)] })
             .filter(([ratio]) => ratio < 4.5) })()"""
     for name in ("textures and colours", "failed", "long-" * 40 + "name", EVERYTHING):
-        chromium.open(pages[name], 1400, dark=dark)
-        assert chromium.evaluate(contrast) == []
-        background = chromium.evaluate("getComputedStyle(document.body).backgroundColor")
-        assert (background == "rgb(255, 255, 255)") == (not dark)
+        chromium.open(pages[name], 1400)
+        for dark in (False, True):
+            chromium.show(1400, dark)
+            assert chromium.evaluate(contrast) == []
+            background = chromium.evaluate("getComputedStyle(document.body).backgroundColor")
+            assert (background == "rgb(255, 255, 255)") == (not dark)
 
 
 def test_losses_of_saved_images_are_drawn(tmp_path):
