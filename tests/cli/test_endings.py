@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -18,7 +19,7 @@ import pytest
 from cli.tiny import COMPLETE, KEY, ROOT, RUN, failing_last, faults, files, full, lines, read_metrics
 from compilation import search_path
 
-from reslrb_cli.cli import main
+from reslrb_cli.cli import main, terminal
 from reslrb_cli.cli.terminal import SAME_S, SIGNALS, Interrupts
 from reslrb_cli.records.manifest import read_content
 from reslrb_cli.runs import recorder as recording
@@ -192,6 +193,29 @@ def test_the_first_signal_only_sets_a_flag(number):
         assert interrupts.requested
     assert [signal.getsignal(other) for other in SIGNALS] == before
     assert not [thread for thread in threading.enumerate() if thread.name == "interrupts"]
+
+
+def test_a_signal_that_comes_twice_at_once_counts_once(monkeypatch):
+    """Another signal, or the same one later, ends the process."""
+    now, ends, said = [100.0], [], []
+    monkeypatch.setattr(terminal, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(terminal, "_say", said.append)
+    for tolerated, signals, count in (
+        (1, ((1, 0.0), (1, SAME_S - 0.01)), 0),
+        (1, ((1, 0.0), (1, SAME_S)), 1),
+        (1, ((1, 0.0), (2, 0.1)), 1),
+        (2, ((1, 0.0), (2, 0.1)), 0),
+        (0, ((1, 0.0),), 1),
+    ):
+        interrupts = Interrupts(tolerated, notice="stopping")
+        monkeypatch.setattr(interrupts, "_end", lambda: ends.append(1))
+        for number, at in signals:
+            now[0] = 100 + at
+            interrupts._see(number)
+        assert interrupts.requested
+        assert (len(ends), said) == (count, ["stopping"] * (tolerated > 0))
+        ends.clear()
+        said.clear()
 
 
 def test_nested_handlers_replace_and_restore_each_other():

@@ -25,7 +25,7 @@ from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Traci
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.manifest import read_manifest
-from reslrb_cli.records.measurements import ALARM, MissingRecord, student
+from reslrb_cli.records.measurements import ALARM, MissingRecord, incomplete_records, student
 from reslrb_cli.report.run_summary import find_remedy, warnings
 from reslrb_cli.scene.parameters import Selection
 
@@ -450,6 +450,34 @@ def record(share: float | None, error: float | None, seeds: int = 8, key: str = 
 def test_consequences_of_a_share(found: MissingRecord, incomplete: bool, refused: bool):
     assert (found.is_incomplete, found.is_for_the_most_part) == (incomplete, refused)
     assert ("detect no missing part" in found.line()) is (found.share == 0.1)
+
+
+@pytest.mark.parametrize(
+    ("share", "margin", "unknown", "decided", "words"),
+    [
+        (None, 0.1, True, False, "seeds cannot distinguish the derivative from 0"),
+        (0.3, 0.3, True, False, "seeds cannot determine the missing share of the derivative (30% +- "),
+        (0.3, 0.29, False, False, ": 30% +- "),
+        (0.3, 0.2, False, True, ": 30% +- "),  # at most one half is missing
+        (0.3, 0.201, False, False, ": 30% +- "),
+        (0.7, 0.2, False, False, ": 70% +- "),  # perhaps one half
+        (0.7, 0.199, False, True, ": 70% +- "),
+        (0.25, 0.25, False, False, "seeds detect no missing part of the derivative (25% +- "),
+        (0.06, 0.05, False, True, ": 6.0% +- "),  # above `NOTICED`
+        (0.02, 0.01, False, True, ": 2.0% +- "),
+        (0.0001, 0.00001, False, True, "seeds detect no missing part of the derivative (0.0% +- "),
+        (0.09949, 0.01, False, True, ": 9.9% +- "),
+        (0.0996, 0.01, False, True, ": 10% +- "),
+    ],
+)
+def test_a_share_and_the_bounds_of_its_interval(
+    share: float | None, margin: float, unknown: bool, decided: bool, words: str
+):
+    found = record(share, margin / student(8, 1))
+    assert (found.is_unknown, found.is_decided) == (unknown, decided)
+    assert words in found.line()
+    assert (incomplete_records([vars(found)]) == [found]) is found.is_incomplete
+    assert replace(found, standard_error=None).percent() == replace(found, share=None).percent() == "an unknown share"
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,14 @@ from cli.tiny import reslrb, settings
 from click.testing import Result
 from kit import scene, sensor, shape
 
-from reslrb_cli.cli.init import PIXELS, _note, choose_size
+from reslrb_cli.cli.init import PIXELS, _entry, _note, choose_size
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import TargetConfig
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.scene.catalog import Value
 from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.proposal import find_movable_in_view, propose
@@ -478,3 +479,28 @@ def test_the_size_of_a_first_run(film, photo, fixed, size):
 def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> None:
     info = SimpleNamespace(value=None, shape=(), remark="a remark")
     assert _note(SimpleNamespace(info=info, share=share)) == f"{words}, a remark"
+
+
+@pytest.mark.parametrize(
+    ("shape", "value", "words"),
+    [
+        ((4, 8, 3), Value(None, 0.5, 0.125, 0.75), ["8x4 texels", "0.125 to 0.75"]),
+        ((3,), Value([0.12345, 1, 2], 0, 0, 0), ["now 0.123 1 2"]),
+        ((7,), Value(None, 0.5, 0.125, 0.75), ["0.125 to 0.75"]),
+    ],
+)
+def test_a_comment_states_the_value(shape: tuple[int, ...], value: Value, words: list[str]) -> None:
+    info = SimpleNamespace(value=value, shape=shape, remark=None)
+    assert _note(SimpleNamespace(info=info, share=1.0)) == ", ".join(["100 % of the picture", *words])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "resolution", "text"),
+    [
+        (None, None, "{key: a.b}"),
+        ("[0, 1]", None, "{key: a.b, bounds: [0, 1]}"),
+        ("[0, 1]", (32, 16), "{key: a.b, bounds: [0, 1], resolution: [32, 16]}"),
+    ],
+)
+def test_an_entry_of_a_parameter(bounds: str | None, resolution: tuple[int, int] | None, text: str) -> None:
+    assert _entry(SimpleNamespace(info=SimpleNamespace(key="a.b"), bounds=bounds, resolution=resolution)) == text

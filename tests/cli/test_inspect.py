@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from cli.tiny import done, outcome
 
-from reslrb_cli.cli.inspect import _sized
-from reslrb_cli.scene.catalog import SensorSummary
+from reslrb_cli.cli.inspect import _counted, _reasons, _sized, _value
+from reslrb_cli.scene.catalog import ParameterInfo, SensorSummary, Value
 
 pytestmark = pytest.mark.usefixtures("llvm")
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
@@ -224,3 +225,37 @@ def test_an_edited_decision_is_one_located_line(scene):
 def test_a_crop_is_shown(crop, text):
     sensor = SensorSummary(0, "a", "perspective", "hdrfilm", (8, 6), crop, "box", 3, None, None, None)
     assert _sized(sensor) == text
+
+
+def info(kind: str = "bsdf", type: str = "Float", shape: tuple[int, ...] = (), **values: Any) -> ParameterInfo:
+    return ParameterInfo("a.b", kind, type, shape, True, False, values.pop("obstacle", None), **values)
+
+
+RANGE = Value(None, 0.25, 0.125, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        (info(value=Value([0.123456], 0, 0, 0)), "0.1235"),
+        (info(shape=(1,), value=Value([0.5], 0, 0, 0)), "[0.5]"),
+        (info(shape=(3,), value=Value([1, 2, 0.5], 0, 0, 0)), "[1, 2, 0.5]"),
+        (info(shape=(4, 8, 1), value=RANGE), "8x4 texels, mean 0.25, 0.125 to 3"),
+        (info(shape=(4, 8, 3), value=RANGE), "8x4 texels of 3, mean 0.25, 0.125 to 3"),
+        (info(shape=(90,), value=RANGE), "90 numbers, mean 0.25, 0.125 to 3"),
+        (info(shape=(4, 4), type="AffineTransform3f", value=RANGE), "4x4 numbers"),
+        (info("shape", shape=(90,), value=RANGE), "90 numbers"),
+        (info(shape=(90,)), "90 numbers"),
+        (info(type="Texture"), "Texture"),
+    ],
+)
+def test_a_value_is_short(given: ParameterInfo, text: str) -> None:
+    assert _value(given) == text
+
+
+def test_obstacles_are_counted_with_the_most_frequent_first() -> None:
+    reasons = ["rare", "often (16 bits)", "often (8 bits)", "also; as it is", "often", "also; otherwise"]
+    assert [line.split(maxsplit=1) for line in _reasons([info(obstacle=each) for each in reasons])] == [
+        ["3", "often"], ["2", "also"], ["1", "rare"],
+    ]  # fmt: skip
+    assert (_counted({"mesh": 2, "sphere": 1}), _counted({})) == ("2 mesh, 1 sphere", "none")

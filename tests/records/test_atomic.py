@@ -15,7 +15,7 @@ import pytest
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records import checkpoint
 from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinished_folder, write_atomically
-from reslrb_cli.records.checkpoint import newest_checkpoint, read_state, save_checkpoint
+from reslrb_cli.records.checkpoint import newest_checkpoint, open_archive, read_state, save_checkpoint
 from reslrb_cli.records.images import MOST_BYTES, file_stem
 from reslrb_cli.records.measurement_files import Origin, write_lines
 
@@ -39,6 +39,25 @@ def test_a_file_appears_when_it_is_complete(tmp_path: Path) -> None:
     assert seen == [(b"old", [f".file.{os.getpid()}.part", "file"])]
     assert path.read_bytes() == b"new"
     assert names(tmp_path) == ["file"]
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_a_durable_file_and_its_name_are_flushed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, durable: bool
+) -> None:
+    """The content before the renaming, and the name after it."""
+    steps: list[str] = []
+    sync, replace = os.fsync, os.replace
+
+    def syncing(descriptor: int) -> None:
+        place = os.readlink(f"/proc/self/fd/{descriptor}")
+        steps.append("name" if place == str(tmp_path) else f"{os.stat(place).st_size} bytes")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", syncing)
+    monkeypatch.setattr(os, "replace", lambda *places: (steps.append("replace"), replace(*places)))
+    write_atomically(tmp_path / "file", lambda file: file.write(b"new"), durable)
+    assert steps == (["3 bytes", "replace", "name"] if durable else ["replace"])
 
 
 def test_a_failure_keeps_the_old_file_and_names_it(tmp_path: Path) -> None:
@@ -169,10 +188,28 @@ def test_on_a_full_disk_both_states_stay(tmp_path: Path, monkeypatch: pytest.Mon
     assert (iteration_of(tmp_path / "state.npz"), iteration_of(tmp_path / "previous.npz")) == (2, 1)
 
 
-def test_a_state_that_is_no_json_is_located(tmp_path: Path) -> None:
-    np.savez(tmp_path / "state.npz", state=np.frombuffer(b"{", np.uint8))
-    with pytest.raises(ConfigError, match=r"state\.npz: state: is no JSON, as a run writes it"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "state: is no JSON, as a run writes it"),
+        ("[1]", "state: is of another version of reslrb"),
+        (f'{{"format": {checkpoint.FORMAT + 1}}}', "state: is of another version of reslrb"),
+    ],
+)
+def test_a_state_that_is_no_json_is_located(tmp_path: Path, text: str, message: str) -> None:
+    np.savez(tmp_path / "state.npz", state=np.frombuffer(text.encode(), np.uint8))
+    with pytest.raises(ConfigError, match=rf"state\.npz: {message}"):
         read_state(tmp_path / "state.npz")
+
+
+@pytest.mark.parametrize(("error", "reason"), [(EOFError(), "EOFError"), (ValueError("no zip"), "no zip")])
+def test_a_damaged_archive_has_a_reason(tmp_path: Path, error: Exception, reason: str) -> None:
+    np.savez(tmp_path / "state.npz", a=np.ones(3))
+    with (
+        pytest.raises(ConfigError, match=rf"or not written by reslrb \({reason}\)$"),
+        open_archive(tmp_path / "state.npz"),
+    ):
+        raise error
 
 
 def test_unopenable_files_are_located(tmp_path: Path) -> None:

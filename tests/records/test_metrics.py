@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import os
 import sys
 import time
 from dataclasses import asdict, replace
@@ -86,6 +87,17 @@ def test_an_incomplete_line_leaves_complete_ones(tmp_path, file_size_limit):
         assert (tmp_path / "metrics.jsonl").stat().st_size == line
         writer.write(make_record(iteration=1))
     assert [record["iteration"] for record in read_metrics(tmp_path)] == [0, 1]
+
+
+def test_lines_are_flushed_before_a_checkpoint(tmp_path, monkeypatch):
+    flushed = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: flushed.append(os.fstat(descriptor).st_size))
+    with MetricsWriter(tmp_path) as writer:
+        writer.sync()
+        assert flushed == []
+        writer.write(make_record())
+        writer.sync()
+        assert flushed == [(tmp_path / "metrics.jsonl").stat().st_size]
 
 
 def test_a_removed_file_is_detected(tmp_path):

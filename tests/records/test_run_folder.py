@@ -320,6 +320,9 @@ def test_the_oldest_entries_are_dropped(tmp_path: Path) -> None:
     (tmp_path / CACHE_FILE).write_text(json.dumps({str(k): made(k).to_json() for k in range(MOST)}))
     cache.put("new", made("new"))
     assert [cache.get(key) for key in ("0", "1", "new")] == [None, made(1), made("new")]
+    cache.put("1", made("again"))  # becomes the newest
+    cache.put("newer", made("newer"))
+    assert [cache.get(key) for key in ("1", "2", "3")] == [made("again"), None, made(3)]
 
 
 @pytest.mark.parametrize("content", ["{", "[1]", '{"a": 3}', "\xff"])

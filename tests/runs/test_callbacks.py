@@ -421,7 +421,8 @@ class FakeMLflow:
     def log_batch(self, which: str, metrics: list[tuple[str, float, int, int]]) -> None:
         if self.lost:
             raise ConnectionError("no route to host")
-        for name, value, _, step in metrics:
+        for name, value, at, step in metrics:
+            assert abs(at / 1000 - time.time()) < 60
             if name == "loss":
                 self.entries[which].losses[step] = value
 
@@ -452,7 +453,7 @@ class FakeWandB:
     def _log(self, entry: Entry, values: dict[str, Any], step: int) -> None:
         if self.lost:
             raise ConnectionError("no route to host")
-        entry.images |= {name for name in values if name.startswith("image/")}
+        entry.images |= {name for name in values if name.startswith(("image/", "value/")) and np.ndim(values[name]) > 1}
         entry.losses |= {step: values["loss"]} if "loss" in values else {}
 
     def _finish(self, entry: Entry, code: int) -> None:
@@ -473,9 +474,9 @@ def server(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> A
     return fake
 
 
-def calls_of(name: str, done: int, *callbacks: rl.Callback) -> Calls:
+def calls_of(name: str, done: int, *callbacks: rl.Callback, shape: tuple[int, ...] = (1,)) -> Calls:
     settings = {"run.iterations": 9, "run.name": name}
-    info = rl.RunInfo(name, Path("runs") / name, settings, 9, done, {"k": (1,)}, lambda key: np.zeros(1))
+    info = rl.RunInfo(name, Path("runs") / name, settings, 9, done, {"k": shape}, lambda key: np.zeros(shape))
     return Calls(callbacks, info, Manifest("v", "d", 0, "c"))
 
 
@@ -529,6 +530,29 @@ def test_an_active_run_of_the_script_is_used(server: Any) -> None:
     iterate(calls, 0, 1)
     calls.end("finished")
     assert (list(server.entries.values()), sorted(own.losses), own.status) == ([own], [0, 1], "RUNNING")
+    assert ("run.name" in own.params) is isinstance(server, FakeMLflow)
+
+
+@pytest.mark.parametrize(
+    ("shape", "names"),
+    [
+        ((), {"value/k"}),
+        ((1,), {"value/k"}),
+        ((2,), {"value/k/0", "value/k/1"}),
+        ((2, 2, 1), {f"value/k/{n}" for n in range(4)}),
+        ((5,), set()),
+    ],
+)
+def test_few_entries_and_the_final_texture_are_logged(server: Any, shape: tuple[int, ...], names: set[str]) -> None:
+    logger, found = server.make(), list[set[str]]()
+    calls = calls_of("a", 0, logger, shape=shape)
+    calls.begin()
+    logger._scalars = lambda values, iteration: found.append({name for name in values if name.startswith("value/")})
+    iterate(calls, 0)
+    assert found == [names]
+    calls.end("finished")
+    (entry,) = server.entries.values()
+    assert entry.images == ({"value/k"} if len(shape) == 3 else set())
 
 
 def test_a_lost_network_does_not_end_a_run(server: Any, caplog: pytest.LogCaptureFixture) -> None:
