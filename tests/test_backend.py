@@ -11,12 +11,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from cli.tiny import ROOT
+from cli.tiny import ROOT, reslrb
 from compilation import search_path
 from conformance.operations import even_table
 
@@ -24,6 +25,7 @@ from reslrb_cli.backend import doctor, llvm, variant
 from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.backend.shared_library import missing_library
 from reslrb_cli.backend.variant import probe
+from reslrb_cli.cli import doctor as doctor_command
 from reslrb_cli.errors import BackendError, ExitCode
 from reslrb_cli.guiding.tables import make_grid
 from reslrb_cli.optimization.views import to_tensor
@@ -418,3 +420,33 @@ def test_a_machine_of_one_core_reads_and_writes_images(tmp_path: Path) -> None:
         env={"PYTHONPATH": search_path(ROOT), "HOME": str(tmp_path)},
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (0, "192.0\n"), done.stderr
+
+
+# `reslrb doctor`.
+
+
+@pytest.mark.parametrize(
+    ("missing", "packages", "lines", "code"),
+    [
+        (("", "no CUDA"), {"drjit": "1"}, ["variant auto is a", "a works on CPU", "lib", "b not usable: no CUDA"], 0),
+        (("too old", ""), {"drjit": "1"}, ["variant auto is b", "a not usable: too old", "b works on GPU"], 0),
+        (("too old", "no CUDA"), {"drjit": "1"}, ["variant none works", "a not usable: too old"], ExitCode.BACKEND),
+        (("", ""), {"reslrb": None, "drjit": "1"}, ["reslrb not installed"], 0),
+        (("", ""), {"reslrb": None, "drjit": None}, ["drjit not installed"], ExitCode.BACKEND),
+    ],
+)
+def test_doctor_names_what_works_and_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, missing: tuple[str, str], packages: dict[str, str | None], lines: list[str],
+    code: int,
+) -> None:  # fmt: skip
+    devices = (("a", "CPU", "lib"), ("b", "GPU", ""))
+    found = [
+        SimpleNamespace(variant=name, device=device, library=library, missing=fault)
+        for (name, device, library), fault in zip(devices, missing, strict=True)
+    ]
+    monkeypatch.setattr(doctor_command, "backends", lambda: found)
+    monkeypatch.setattr(doctor_command, "packages", lambda: packages)
+    result = reslrb("doctor")
+    said = [" ".join(line.split()) for line in result.stdout.splitlines()]
+    assert (set(lines) <= set(said), "lib" in said, result.exit_code) == (True, not missing[0], code)
+    assert ("pip install drjit" in result.output) is (packages["drjit"] is None)

@@ -213,7 +213,9 @@ def _colmap(file: Path) -> list[Camera]:
             raise ConfigError(
                 place, "", "is not an image: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
             ) from None
-        if camera not in models or not name or not np.isfinite([w, *pose]).all():
+        if not np.isfinite([w, *pose]).all():
+            raise ConfigError(place, "", "has a number that is not finite")
+        if camera not in models or not name:
             raise ConfigError(place, "", f"has camera {camera}, which cameras.txt lacks, or no name")
         to_world = np.eye(4)
         to_world[:3, :3], to_world[:3, 3] = rotation.T, -rotation.T @ pose[3:]

@@ -228,6 +228,7 @@ def test_nested_handlers_replace_and_restore_each_other():
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.05)
         assert outer.requested
+    assert signal.set_wakeup_fd(-1) == -1
 
 
 def test_other_threads_are_unaffected():

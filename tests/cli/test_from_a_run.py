@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -15,6 +18,7 @@ from turns import a_few
 
 import reslrb_cli as rl
 from reslrb_cli.api.experiment import called
+from reslrb_cli.cli.render import check_image_path
 from reslrb_cli.config.loader import Override, load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
@@ -22,6 +26,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
 from reslrb_cli.records.run_folder import read_value, recovered
+from reslrb_cli.runs import export
 from reslrb_cli.runs.export import choose_integrator
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -314,3 +319,47 @@ def test_an_export_says_what_path_renders_wrongly(tmp_path: Path) -> None:
         integrator, why = choose_integrator(config, scene, mi.traverse(scene), paths)
         assert integrator["type"] == "path"
         assert why == f", {since}but path renders blends of singular and smooth lobes wrongly"
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        ({}, None),
+        ({0: 1.0, 2: [1.0]}, None),
+        ({0: 1.0, 2: 0.25}, "1 (sensor 0), 0.25 (sensor 2)"),
+        ({0: 0.25, 2: 0.25}, "0.25"),
+        ({0: [1, 2, 0.123456]}, "1 2 0.1235"),
+    ],
+)
+def test_the_line_with_the_exposures(monkeypatch: pytest.MonkeyPatch, found: dict[int, Any], words: str | None) -> None:
+    monkeypatch.setattr(export, "exposures", lambda run: found)
+    said = "" if words is None else f"multiply renderings by the exposure, {words}, to match the photographs"
+    assert export.exposure_line(Path("run")) == said
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.exr", None),
+        ("A.PNG", None),
+        ("here/a.jpeg", None),
+        ("a.gif", "a.gif has no known image format; use .exr"),
+        ("exr", "exr has no known image format"),
+        ("folder.exr", "folder.exr is a folder, or in a folder that does not exist"),
+        ("nowhere/a.exr", "nowhere/a.exr is a folder, or in a folder that does not exist"),
+        ("pipe.exr", "pipe.exr is not a regular file"),
+    ],
+)
+def test_the_file_of_an_image_is_checked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, message: str | None
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("here", "folder.exr"):
+        Path(folder).mkdir()
+    os.mkfifo("pipe.exr")
+    if message is None:
+        check_image_path(Path(name))
+        assert not Path(name).exists()
+    else:
+        with pytest.raises(ConfigError, match=re.escape(f"--output: {message}")):
+            check_image_path(Path(name))

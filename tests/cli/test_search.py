@@ -7,6 +7,8 @@ import json
 import math
 import os
 import shlex
+import signal
+import subprocess
 import sys
 import threading
 import time
@@ -504,3 +506,50 @@ def test_a_fault_of_one_run_interrupts_the_others(folder, monkeypatch, four_core
     assert result.exit_code == 6
     assert "the disk is full; `reslrb sweep --resume s` continues" in result.output
     assert ends == ["fault", "interrupted"]
+
+
+def test_the_end_of_a_sweep_ends_every_run(monkeypatch):
+    """A run that ignores both signals, one that has ended already, and one that ends in time."""
+    done = []
+
+    class Process:
+        def __init__(self, name, fault=None, waits=()):
+            self.name, self.fault, self.waits = name, fault, list(waits)
+
+        def send_signal(self, number):
+            done.append((self.name, number))
+            if self.fault is not None:
+                raise self.fault
+
+        def wait(self, seconds):
+            assert 0 <= seconds <= jobs.END_SECONDS
+            done.append((self.name, "wait"))
+            if self.name == "deaf":
+                raise subprocess.TimeoutExpired("reslrb", seconds)
+
+        def kill(self):
+            done.append((self.name, "kill"))
+
+    pool = jobs.Jobs(1, "llvm_ad_rgb")
+    pool.slots = [jobs.RunSlot() for _ in range(4)]
+    for slot, process in zip(
+        pool.slots, (Process("deaf"), None, Process("gone", ProcessLookupError()), Process("quick")), strict=True
+    ):
+        slot.process = process
+    pool.end()
+    names = ["deaf", "gone", "quick"]
+    assert done[:6] == [(name, number) for number in (signal.SIGTERM, signal.SIGINT) for name in names]
+    assert done[6:] == [(name, what) for name in names for what in ("wait", "kill")]
+
+
+def test_progress_of_runs_is_for_terminals_alone(monkeypatch, capsys):
+    pool = jobs.Jobs(1, "llvm_ad_rgb")
+    pool.slots = [jobs.RunSlot(line="3/9"), jobs.RunSlot(), jobs.RunSlot(line="x" * 99)]
+    pool.show()
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(jobs.shutil, "get_terminal_size", lambda: os.terminal_size((20, 5)))
+    pool.show()
+    shown = capsys.readouterr().err
+    assert shown.startswith("\r\x1b[K  3/9; x")
+    assert len(shown) == len("\r\x1b[K") + 19

@@ -226,10 +226,33 @@ def test_calls_have_more_time_than_the_longest_one(me: SimpleNamespace, monkeypa
     assert calls.CALL_S + 10 * 2.0 <= known_s == again_s < calls.CALL_S + 10 * 2.0 + 5
 
 
+@pytest.mark.parametrize(("allowed", "own", "asks"), [(True, False, True), (True, True, False), (False, False, False)])
+def test_workers_of_others_are_asked_for_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, allowed: bool, own: bool, asks: bool
+) -> None:
+    monkeypatch.setattr(engine, "check_files", lambda files, config: None)
+    course = SimpleNamespace(
+        problem=SimpleNamespace(config=SimpleNamespace(allows_code=allowed), views=[]), files={},
+        save=lambda folder: (folder / "state.npz").write_bytes(b"state"),
+    )  # fmt: skip
+    workload = engine.workload_of(course, tmp_path, 2, own)
+    assert (workload.arguments, workload.asks_for_code, workload.threads) == ((allowed,), asks, 2)
+    assert (workload.files["state.npz"], set(workload.files)) == (b"state", {"state.npz", "targets.npz"})
+
+
+def test_another_workload_is_refused(me: SimpleNamespace) -> None:
+    for other in ({}, {"reslrb": object()}, {"reslrb": calls.Workload({}, lambda folder, threads: ("", {}), key="b")}):
+        me.plugins.clear()
+        me.plugins.update(other)
+        with pytest.raises(MachineError, match="lacks the experiment; another run may use it"):
+            calls.perform("a", b"", str.upper, ())
+
+
 def test_places_have_bounds() -> None:
     assert Cluster.parse("tls://there:65535") == Cluster(address="tls://there:65535")
     assert Cluster.parse(f"local:{connection.MOST_WORKERS}") == Cluster(connection.MOST_WORKERS)
-    for text in ("tls://there:65536", "tls://there:0", f"local:{connection.MOST_WORKERS + 1}", "local:0", "local:-1"):
+    for text in ("tls://there:65536", "tls://there:0", f"local:{connection.MOST_WORKERS + 1}", "local:0", "local:-1",
+                 "local:" + 5000 * "9"):  # fmt: skip
         with pytest.raises(ConfigError, match="--cluster: must be local:N"):
             Cluster.parse(text)
 

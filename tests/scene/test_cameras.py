@@ -248,6 +248,7 @@ def test_errors_in_a_cameras_txt(folder, model, message):
         (" 7 b.exr", " 8 b.exr", "images.txt:4: has camera 8, which cameras.txt lacks"),
         (" 7 b.exr", " 7", "images.txt:4: has camera 7, which cameras.txt lacks, or no name"),
         (" 7 b.exr", " b.exr", "images.txt:4: is not an image: IMAGE_ID, QW, QX"),
+        (" 7 b.exr", "e999 7 b.exr", "images.txt:4: has a number that is not finite"),
         (" 7 a.exr\n0.5 0.5 -1\n", " 7 a.exr\n\n\n", None),  # an empty line between images
     ],
 )

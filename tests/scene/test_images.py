@@ -395,8 +395,9 @@ def test_channels_of_an_exr_have_their_own_types(tmp_path):
 
 def test_primaries_of_an_exr_are_converted_with_or_without_other_channels(tmp_path):
     acescg = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
-    for name, channels in (("a.exr", "RGB"), ("b.exr", "RGBZ")):
+    for name, channels in (("a.exr", "RGB"), ("b.exr", "RGBZ"), ("grey.exr", "YZ")):
         (tmp_path / name).write_bytes(exr_of(channels, np.float32, acescg)[0])
+    assert (read_image(tmp_path / "grey.exr") == 0.25).all()
     alone = np.array(mi.Bitmap(str(tmp_path / "a.exr")))
     np.testing.assert_allclose(read_image(tmp_path / "a.exr"), alone, rtol=1e-6)
     np.testing.assert_allclose(read_image(tmp_path / "b.exr"), alone, rtol=1e-3)
@@ -605,6 +606,31 @@ def test_values_are_at_most_the_maximum(data, is_whole, tmp_path):
     else:
         with pytest.raises(ConfigError, match=r"a\.pgm: is not a readable image"):
             read_image(tmp_path / "a.pgm")
+
+
+@pytest.mark.parametrize(
+    ("head", "is_read"),
+    [
+        (b"P6 1 1 255\n", True),
+        (b"P6 1 1 254\n", False),
+        (b"P5 1 1 255\n", False),
+        (b"PF 1 1 -1\n", True),
+        (b"Pf 1 1 1\n", True),
+    ],
+)
+def test_portable_pixmaps_that_mitsuba_reads(head, is_read, tmp_path):
+    (tmp_path / "a.pnm").write_bytes(head)
+    with (tmp_path / "a.pnm").open("rb") as file:
+        assert (images._netpbm(tmp_path / "a.pnm", file).wrong == "") is is_read
+
+
+def test_a_wrong_pixel_is_located_and_pixels_are_counted_once(tmp_path):
+    pixels = np.ones((2, 3, 3), np.float32)
+    pixels[1, 2] = -1, -2, 3
+    pixels[1, 0, 1] = -3
+    write(tmp_path / "a.exr", pixels)
+    with pytest.raises(ConfigError, match=r"pixel \(0, 1\), channel G, is -3: negative \(2 pixels in all\)"):
+        read_image(tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("restart", range(0xD0, 0xD8))

@@ -13,6 +13,7 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from reslrb_cli.errors import UnsupportedScene
+from reslrb_cli.scene import graph
 from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
@@ -509,3 +510,24 @@ def test_a_shape_in_a_group_is_shown_if_the_scene_has_it_too():
     group, scene = (SimpleNamespace(class_name=lambda name=name: name) for name in ("ShapeGroupPlugin", "Scene"))
     assert not SceneGraph(parents={"shape": [group]}).is_shown("shape")
     assert SceneGraph(parents={"shape": [group, scene]}).is_shown("shape")
+
+
+@pytest.mark.parametrize(
+    ("kind", "faces", "parallel", "beam"),
+    [
+        ("Rectangle", False, True, True),
+        ("Disk", False, True, True),
+        ("Rectangle", False, False, False),
+        ("Sphere", False, True, False),
+        ("Mesh", True, True, True),
+        ("Mesh", False, True, False),
+    ],
+)
+def test_beams_are_parallel_light_of_flat_faces(
+    monkeypatch: pytest.MonkeyPatch, kind: str, faces: bool, parallel: bool, beam: bool
+) -> None:
+    monkeypatch.setattr(graph, "interpolates_normals", lambda shape: not faces)
+    shape = SimpleNamespace(class_name=lambda: kind, is_mesh=lambda: kind == "Mesh", has_flipped_normals=lambda: True)
+    lamp = graph.Lamp(shape, None, 0, parallel, None)
+    assert lamp.is_beam is beam
+    assert lamp.surrounds is (kind == "Sphere" and not parallel)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.scene import parameters
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -354,3 +356,46 @@ def test_light_through_a_twosided_bsdf_is_refused(make_scene):
     scene = with_bsdf(make_scene, type="twosided", inside={"type": "principled"})
     with pytest.raises(ConfigError, match="lets light through a `twosided` BSDF"):
         select(scene, {"key": "plane.bsdf.brdf_0.spec_trans.value"})
+
+
+@pytest.mark.parametrize(
+    ("word", "names", "is_point", "is_shape", "pivot", "said"),
+    [
+        (
+            "translation",
+            ["DirectionalEmitter"],
+            False,
+            False,
+            False,
+            "translation does not move `a`, which is a direction",
+        ),
+        ("rotation", ["DirectionalEmitter"], False, False, False, None),
+        ("x", ["DirectionalEmitter", "Mesh"], False, True, False, None),
+        (
+            "rotation.x",
+            ["PointLight"],
+            True,
+            False,
+            False,
+            "rotation.x about itself does not move `a`, which is a point",
+        ),
+        ("scale", ["PointLight"], True, False, False, "scale about itself does not move `a`, which is a point"),
+        ("translation", ["PointLight"], True, False, False, None),
+        ("rotation", ["PointLight"], True, False, True, None),
+        ("rotation", ["PointLight", "Mesh"], True, False, False, None),
+        ("scale", ["SpotLight"], False, False, False, "scale about itself does not move `a`, which has no size"),
+        ("scale", ["Mesh"], False, True, False, None),
+        ("rotation", ["SpotLight"], False, False, False, None),
+    ],
+)
+def test_motions_without_an_effect(
+    word: str, names: list[str], is_point: bool, is_shape: bool, pivot: bool, said: str | None
+) -> None:
+    nodes = [SimpleNamespace(class_name=lambda name=name: name) for name in names]
+    items = [SimpleNamespace(id="a", node=node, is_point=is_point, is_shape=is_shape) for node in nodes]
+    place = parameters.Place("a.yaml", "parameters[0]", lambda key: key)
+    if said is None:
+        parameters._check_effect(items, word, pivot, place)
+    else:
+        with pytest.raises(ConfigError, match=re.escape(said)):
+            parameters._check_effect(items, word, pivot, place)
