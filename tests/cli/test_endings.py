@@ -22,6 +22,7 @@ from compilation import search_path
 from reslrb_cli.cli import main, terminal
 from reslrb_cli.cli.terminal import SAME_S, SIGNALS, Interrupts
 from reslrb_cli.records.manifest import read_content
+from reslrb_cli.runs import prepare
 from reslrb_cli.runs import recorder as recording
 
 # The end of a run, in this process. Each part is written on its own, the manifest first. Nothing is lost, and the
@@ -48,6 +49,27 @@ def test_a_signal_ends_a_run_after_the_iteration(optimize, during):
     *_, ending, advice = out.splitlines()
     assert ending.startswith("interrupted after 2 iterations")
     assert advice == f"next: `reslrb optimize --resume {RUN}` continues this run"
+
+
+@pytest.mark.parametrize(
+    ("every", "saved"),
+    [
+        ("{iterations: 2}", [0, 2, 4, 5]),
+        ("{iterations: 6}", [0, 5]),
+        ("{seconds: 59}", [0, 1, 2, 3, 4, 5]),
+        ("{seconds: 60}", [0, 2, 4, 5]),
+        ("{seconds: 120}", [0, 3, 5]),
+    ],
+)
+def test_checkpoints_have_the_given_distance(optimize, during, monkeypatch, every, saved):
+    """Each iteration takes a minute. The first and the last state are always saved, each state once."""
+    now, found = [100.0], []
+    save = prepare.save_checkpoint
+    monkeypatch.setattr(prepare, "save_checkpoint", lambda *given: (found.append(given[1]), save(*given)))
+    monkeypatch.setattr(recording, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    during(lambda record: now.append(now.pop() + 60))
+    assert optimize("--set", f"run.checkpoint_every={every}", "--set", "run.final_spp=1")[0] == 0
+    assert found == saved
 
 
 @pytest.mark.parametrize(("name", "call"), [("write_image", 0), ("write_image", 2)])

@@ -23,7 +23,7 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.catalog import Value
 from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
 from reslrb_cli.scene.load import load_scene
-from reslrb_cli.scene.proposal import find_movable_in_view, propose
+from reslrb_cli.scene.proposal import TEXELS, _resolution, find_movable_in_view, propose
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -492,6 +492,20 @@ def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> 
 def test_a_comment_states_the_value(shape: tuple[int, ...], value: Value, words: list[str]) -> None:
     info = SimpleNamespace(value=value, shape=shape, remark=None)
     assert _note(SimpleNamespace(info=info, share=1.0)) == ", ".join(["100 % of the picture", *words])
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"),
+    [
+        ((3,), None),
+        ((TEXELS, TEXELS, 3), None),
+        ((TEXELS // 2, TEXELS + 1, 3), (TEXELS, TEXELS // 2)),
+        ((4 * TEXELS, TEXELS, 1), (TEXELS // 4, TEXELS)),
+        ((1, 4 * TEXELS, 3), (TEXELS, 3)),
+    ],
+)
+def test_a_large_texture_is_recovered_at_fewer_texels(shape: tuple[int, ...], size: tuple[int, int] | None) -> None:
+    assert _resolution(SimpleNamespace(shape=shape)) == size
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from cli.tiny import outcome
 from records.test_metrics import make_record
 from tqdm import tqdm
 
-from reslrb_cli.cli import lens
+from reslrb_cli.cli import lens, optimize
 from reslrb_cli.cli.lens import show_stages
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import LogLines
@@ -167,6 +167,32 @@ def test_progress_is_shown_on_terminals_of_any_size(
     os.close(ours)
     assert (line in shown) == (columns == 0)
     assert shown.strip()
+
+
+@pytest.mark.parametrize(
+    ("total", "done", "seconds", "shown"),
+    [
+        (30, 0, 0.0, [3, 6, 9, 12, 15, 18, 21, 24, 27, 30]),
+        (5, 0, 0.0, [1, 2, 3, 4, 5]),
+        (30, 4, 0.0, [6, 9, 12, 15, 18, 21, 24, 27, 30]),
+        (30, 24, 4.0, [27, 30]),
+        (30, 24, 5.0, [26, 27, 29, 30]),
+        (30, 24, 9.9, [26, 27, 29, 30]),
+        (30, 24, 10.0, [25, 26, 27, 28, 29, 30]),
+    ],
+)
+def test_a_line_for_each_tenth_and_each_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], total: int, done: int, seconds: float,
+    shown: list[int],
+) -> None:  # fmt: skip
+    now = [100.0]
+    monkeypatch.setattr(optimize.time, "monotonic", lambda: now[0])
+    with Progress(total, quiet=False, meter=make_meter(1), done=done) as progress:
+        for number in range(done, total):
+            now[0] += seconds
+            progress.show(record(number, 1))
+    lines = capsys.readouterr().err.splitlines()
+    assert [int(line.partition(f"/{total}: loss")[0]) for line in lines] == shown
 
 
 # Progress on terminals of any width: a bar, the percentage, the loss, and no truncated number.

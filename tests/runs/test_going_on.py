@@ -12,6 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -36,6 +37,7 @@ from reslrb_cli.guiding.tables import Learned
 from reslrb_cli.optimization import loop, optimizers
 from reslrb_cli.records.checkpoint import STATE_FILE, read_state
 from reslrb_cli.records.manifest import read_manifest
+from reslrb_cli.runs.resume import OpenedRun
 
 # A resumed run ends where the whole run would have ended, bit for bit, with one thread.
 
@@ -282,3 +284,34 @@ def test_a_run_killed_fifty_times_reaches_the_same_end(tmp_path: Path) -> None:
     assert differences(tmp_path / "runs/whole", run) == []
     assert [record["iteration"] for record in records_of(run)] == list(range(1200))
     assert read_manifest(run)["status"] == "finished"  # type: ignore[index]
+
+
+@pytest.mark.parametrize(
+    ("status", "done", "of", "stopped", "seconds", "changed", "is_done", "line"),
+    [
+        ("finished", 9, 9, "", None, (), True, "after 9 of 9 iterations; --set run.iterations=NUMBER continues it"),
+        ("interrupted", 9, 9, "", None, (), False, None),
+        ("finished", 9, 12, "", None, ("run.iterations",), False, None),
+        ("finished", 5, 9, "no time", 3, (), True,
+         "after 5 of 9 iterations; --set run.max_seconds=NUMBER continues it"),
+        ("finished", 5, 9, "no time", 8, ("run.max_seconds",), False, None),
+        ("finished", 9, 9, "no time", 8, ("run.max_seconds",), True,
+         "after 9 of 9 iterations; --set run.iterations=NUMBER continues it"),
+        ("finished", 5, 9, "converged", None, (), True, "after 5 of 9 iterations: converged"),
+        ("interrupted", 5, 9, "converged", None, (), False, None),
+    ],
+)  # fmt: skip
+def test_a_run_is_complete_unless_a_setting_continues_it(
+    status: str, done: int, of: int, stopped: str, seconds: float | None, changed: tuple[str, ...], is_done: bool,
+    line: str | None,
+) -> None:  # fmt: skip
+    stored: Any = SimpleNamespace(read=lambda kind: SimpleNamespace(stopped=stopped))
+    settings = SimpleNamespace(iterations=of, max_seconds=seconds)
+    config: Any = SimpleNamespace(run=settings, source=Path("runs/a/config.yaml"))
+    nothing: Any = None
+    manifest = {"status": status}
+    run = OpenedRun(nothing, manifest, stored, nothing, config, dict.fromkeys(changed, (1, 2)), done)
+    assert run.is_done is is_done
+    assert run.has_stopped is bool(stopped and "run.max_seconds" not in changed)
+    if line is not None:
+        assert run.done_line("--set", "=") == f"runs/a: is finished, {line}"
