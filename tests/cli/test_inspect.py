@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from cli.tiny import done, outcome
 
-from reslrb_cli.cli.inspect import _counted, _reasons, _sized, _value
+from reslrb_cli.cli.inspect import _counted, _reasons, _sized, _value, next_step, run_words
 from reslrb_cli.scene.catalog import ParameterInfo, SensorSummary, Value
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -259,3 +260,44 @@ def test_obstacles_are_counted_with_the_most_frequent_first() -> None:
         ["3", "often"], ["2", "also"], ["1", "rare"],
     ]  # fmt: skip
     assert (_counted({"mesh": 2, "sphere": 1}), _counted({})) == ("2 mesh, 1 sphere", "none")
+
+
+@pytest.mark.parametrize(
+    ("run", "words"),
+    [
+        ({"status": "running"}, "running"),
+        ({"status": "finished", "results": {"iterations": 0}, "error": None}, "finished, 0 iterations"),
+        ({"status": "failed", "results": {"iterations": 3}, "error": "full"}, "failed, 3 iterations, full"),
+    ],
+)
+def test_a_run_in_words(run: dict[str, Any], words: str) -> None:
+    assert run_words(run) == words
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "keys", "missing", "is_scene", "run", "step"),
+    [
+        ([("dark", "dark")], ["a.b"], [], False, None, "change the scene so that it can be rendered"),
+        ([("dark", "dark"), (None, None)], ["a.b"], [], False, None, "`reslrb optimize a.yaml` runs it"),
+        ([("dark", "other")], ["a.b"], [], False, None, "`reslrb optimize a.yaml` runs it"),
+        ([], ["a.b"], [], False, None, "`reslrb optimize a.yaml` runs it"),
+        ([], ["a.b"], [], False, {}, "`reslrb optimize a.yaml` runs it"),
+        ([], ["a.b"], [], False, {"status": "finished"}, "`reslrb optimize a.yaml` runs it again"),
+        ([], [], ["target"], True, None, "no parameter can be recovered"),
+        ([], ["a.b", "c"], ["target", "parameters"], True, None, "`reslrb init a --target PHOTO` writes"),
+        ([], ["a.b", "c"], ["target"], False, None, "add `target: {file: IMAGE}` to a, then run `reslrb optimize a`"),
+        ([], ["a.b", "c"], ["target", "parameters"], False, None,
+         'add `target: {file: IMAGE}` and `parameters: [{key: "a.b"}]` to a, then run `reslrb optimize a`'),
+    ],
+)  # fmt: skip
+def test_the_next_step(
+    obstacles: list[tuple[str | None, str | None]], keys: list[str], missing: list[str], is_scene: bool,
+    run: dict[str, Any] | None, step: str,
+) -> None:  # fmt: skip
+    sensors = [SimpleNamespace(obstacle=light, camera_obstacle=camera) for light, camera in obstacles]
+    infos = [SimpleNamespace(key=key, obstacle=None if key in keys else "a reason") for key in ("none", *keys)]
+    config = SimpleNamespace(source="a.yaml")
+    subject: Any = SimpleNamespace(missing=missing, is_scene=is_scene, path="a", run=run, config=config)
+    summary: Any = SimpleNamespace(sensors=sensors, parameters=infos)
+    found = next_step(subject, summary)
+    assert found == step if step.endswith(("it", "again", "a`")) else found.startswith(step)

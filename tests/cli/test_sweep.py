@@ -25,6 +25,7 @@ from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import Interrupts
 from reslrb_cli.config.loader import dump, load
 from reslrb_cli.errors import ConfigError, ExitCode
+from reslrb_cli.records import sweeps as plans_file
 from reslrb_cli.records.images import load_image
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.records.sweeps import (
@@ -640,3 +641,27 @@ def test_the_page_has_a_table_curves_and_pictures(folder):
     assert "&lt;b&gt;x" in text
     assert "<b>x" not in text
     assert "<i>k" not in text
+
+
+@pytest.mark.parametrize(
+    ("names", "version", "message"),
+    [
+        (["a", "b=1.5", "+x", "ä-1"], plans_file.VERSION, None),
+        ([""], plans_file.VERSION, None),
+        (["a", "a"], plans_file.VERSION, "combinations: have names that are no names of folders, or twice the same"),
+        (["a", "A"], plans_file.VERSION, "combinations: have names"),
+        (["../a"], plans_file.VERSION, "combinations: have names"),
+        ([".a"], plans_file.VERSION, "combinations: have names"),
+        (["a/b"], plans_file.VERSION, "combinations: have names"),
+        (["a"], plans_file.VERSION + 1, "version: was written by another version, "),
+    ],
+)
+def test_names_of_a_stored_sweep(tmp_path: Path, names: list[str], version: int, message: str | None) -> None:
+    combinations = [Combination(name, {"run.spp": place}) for place, name in enumerate(names)]
+    sweep = SweepPlan("a.yaml", [], combinations, [1, 2], version=version)
+    sweep.write(tmp_path)
+    if message is None:
+        assert read_sweep(tmp_path) == sweep
+    else:
+        with pytest.raises(ConfigError, match=rf"sweep\.json: {message}"):
+            read_sweep(tmp_path)

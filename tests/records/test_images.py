@@ -12,6 +12,7 @@ import pytest
 from reslrb_cli.records import images
 from reslrb_cli.records.images import (
     FORMATS,
+    as_bytes,
     finite_range,
     load_image,
     luminance,
@@ -161,3 +162,21 @@ def test_damaged_files_are_reported(tmp_path):
 
 def test_channels_of_a_layer_have_an_order():
     assert sorted(["Z", "A", "2", "B", "10", "R", "G", "1"], key=images._place) == [*"RGBA", "Z", "1", "2", "10"]
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize(
+    ("pixel", "shown"),
+    [
+        ([0.0, 0.5, 1.0], [0, 188, 255]),
+        ([-1.0, np.nan, 2.0], [0, 0, 255]),
+        ([np.inf, -np.inf, 0.0], [255, 0, 0]),
+        ([1.0, 1.0, 1.0, 0.0], [255, 255, 255]),  # without alpha
+        ([0.5, 1.0], [188]),
+        ([0.5], [188]),
+    ],
+)
+def test_values_as_bytes(pixel: list[float], shown: list[int]) -> None:
+    found = as_bytes(np.float32([[pixel, pixel]]))
+    assert (found.shape, found.dtype) == ((1, 2, len(shown)), np.uint8)
+    np.testing.assert_allclose(found[0].astype(int), [shown, shown], atol=1)  # Mitsuba dithers

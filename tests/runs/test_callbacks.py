@@ -315,15 +315,17 @@ def test_the_log_file_has_the_lines_of_its_run(experiment: Path, caplog: pytest.
     assert Path("runs/a/run.log").read_text().count("rendering the final image") == 2
 
 
-def test_warnings_are_printed_without_any_logging(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_warnings_are_printed_without_any_logging(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, caplog: pytest.LogCaptureFixture
+) -> None:
     logger = logging.getLogger("reslrb_cli")
     for each in (logger, logging.getLogger()):
         monkeypatch.setattr(each, "handlers", [])
-    with log.collected() as lines:
+    with caplog.at_level(logging.INFO, logger.name), log.collected() as lines:
         logger.warning("seen once")
         logger.info("not printed")
     assert capsys.readouterr().err == "seen once\n"
-    assert lines[0].endswith(" WARNING seen once")
+    assert [line.partition(" ")[2] for line in lines] == ["WARNING seen once", "INFO not printed"]
 
 
 def test_the_manifest_names_the_commit_of_the_configuration(experiment: Path) -> None:

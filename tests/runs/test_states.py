@@ -335,6 +335,7 @@ def test_only_the_place_of_a_file_may_change(interrupted: Path) -> None:
     cases: dict[tuple[str, object, object], bool] = {
         ("scene.file", "/a/scene.xml", "/b/other.xml"): True,
         ("scene.file", None, "/b/scene.xml"): False,
+        ("scene.file", "/a/scene.xml", None): False,
         ("loss.file", "/a/own.py:f", "/b/other.py:f"): True,
         ("loss.file", "/a/own.py:f", "/a/own.py:g"): False,
         ("run.spp", 4, 8): False,

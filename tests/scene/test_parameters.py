@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from reslrb_cli.config.parameters import ImageFile, ParameterSpec
+from reslrb_cli.config.parameters import ImageFile, ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import parameters
+from reslrb_cli.scene import parameters, values
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -399,3 +402,52 @@ def test_motions_without_an_effect(
     else:
         with pytest.raises(ConfigError, match=re.escape(said)):
             parameters._check_effect(items, word, pivot, place)
+
+
+@pytest.mark.parametrize(
+    ("shape", "at", "words"),
+    [
+        ((), (), "2.5"),
+        ((3,), (1,), "2.5 at entry 1"),
+        ((2, 3), (1, 2), "2.5 at entry [1, 2]"),
+        ((2, 3, 3), (1, 2, 0), "2.5 at texel (2, 1), channel 0"),
+        ((2,), None, None),
+    ],
+)
+def test_the_first_entry_is_named(shape: tuple[int, ...], at: tuple[int, ...] | None, words: str | None) -> None:
+    array = np.zeros(shape, np.float32)
+    if at is not None:
+        array[at] = 2.5
+    assert values.first_entry(array, array > 1) == words
+
+
+@pytest.mark.parametrize(
+    ("transform", "of_run", "value", "is_valid"),
+    [
+        ("none", False, -9.0, True),
+        ("sigmoid", False, 0.25, False),
+        ("sigmoid", False, 0.26, True),
+        ("sigmoid", False, 0.75, False),
+        ("sigmoid", True, 0.25, True),
+        ("sigmoid", True, 0.75, True),
+        ("sigmoid", True, 0.24, False),
+        ("sigmoid", True, 0.76, False),
+        ("log", False, 0.0, False),
+        ("log", True, 0.0, False),
+        ("log", False, 1e-9, True),
+    ],
+)
+def test_a_start_lies_in_the_range_of_its_transform(transform: str, of_run: bool, value: float, is_valid: bool) -> None:
+    start = RunValue(run=Path("run")) if of_run else value
+    spec: Any = SimpleNamespace(transform=transform, bounds=(0.25, 0.75), initial=start)
+    slot: Any = SimpleNamespace(key="a.b")
+    place = values.Place("a.yaml", "parameters[0]")
+    if is_valid:
+        values.check_transform(slot, np.float32([value]), spec, place)
+    else:
+        with pytest.raises(ConfigError, match=rf"parameters\[0\]\.initial: `a\.b` starts at {value:g} at entry 0; "):
+            values.check_transform(slot, np.float32([value]), spec, place)
+    if transform == "sigmoid":
+        refused = pytest.raises(ConfigError, match="bounds: exclude the initial value")
+        with contextlib.nullcontext() if 0.25 <= value <= 0.75 else refused:
+            values.check_bounds(slot, np.float32([value]), (0.25, 0.75), place)
