@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -23,7 +24,7 @@ from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.catalog import Value
 from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
 from reslrb_cli.scene.load import load_scene
-from reslrb_cli.scene.proposal import TEXELS, _resolution, find_movable_in_view, propose
+from reslrb_cli.scene.proposal import TEXELS, _resolution, find_movable_in_view, propose, usual_bounds
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -506,6 +507,34 @@ def test_a_comment_states_the_value(shape: tuple[int, ...], value: Value, words:
 )
 def test_a_large_texture_is_recovered_at_fewer_texels(shape: tuple[int, ...], size: tuple[int, int] | None) -> None:
     assert _resolution(SimpleNamespace(shape=shape)) == size
+
+
+@pytest.mark.parametrize(
+    ("key", "low", "high", "bounds"),
+    [
+        ("wall.reflectance.data", 0.0, 1.0, "[0, 1]"),
+        ("wall.reflectance.data", 0.0, 1.01, None),
+        ("wall.reflectance.data", -0.01, 1.0, None),
+        ("mesh.vertex_color", 0.5, 0.5, "[0, 1]"),
+        ("metal.alpha_u", 0.02, 0.3, "[0.02, 1]"),
+        ("metal.alpha.value", 0.01, 0.01, None),
+        ("metal.eta.value", 0.1, 10, "[0, 10]"),
+        ("glass.eta", 1.5, 1.5, "[1.01, 3]"),
+        ("glass.Vd", 59, 59, "[10, 100]"),
+        ("lamp.emitter.radiance.value", 0, 1e6, "[0, .inf]"),
+        ("sky.scale", 3, 3, "[0, .inf]"),
+        ("sky.turbidity", 1, 10, "[1, 10]"),
+        ("glass.B1", 1, 1, "[0.5, 2]"),
+        ("glass.C1", 0.006, 0.006, "[0, 0.08]"),
+        ("glass.C3", 100, 100, "[50, 200]"),
+        ("wall.normal", 0, 1, None),
+    ],
+)
+def test_usual_bounds(key: str, low: float, high: float, bounds: str | None) -> None:
+    info: Any = SimpleNamespace(key=key, value=Value(None, low, low, high))
+    assert usual_bounds(info) == bounds
+    if key == "wall.reflectance.data":
+        assert usual_bounds(SimpleNamespace(key=key, value=None)) == "[0, 1]"
 
 
 @pytest.mark.parametrize(

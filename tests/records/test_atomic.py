@@ -14,7 +14,7 @@ import pytest
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records import checkpoint
-from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinished_folder, write_atomically
+from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinished_folder, write_atomically, writing
 from reslrb_cli.records.checkpoint import newest_checkpoint, open_archive, read_state, save_checkpoint
 from reslrb_cli.records.images import MOST_BYTES, file_stem
 from reslrb_cli.records.measurement_files import Origin, write_lines
@@ -87,6 +87,22 @@ def test_a_process_that_exits_at_once_can_tidy_up(tmp_path: Path) -> None:
 
     with pytest.raises(FileNotFoundError):
         write_atomically(tmp_path / "file", leave)
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "message"),
+    [
+        (OSError(errno.EACCES, "Permission denied", "b/c"), ConfigError, "--json: cannot write b/c: Permission denied"),
+        (OSError(errno.EACCES, "Permission denied"), ConfigError, "--json: cannot write a: Permission denied"),
+        (RuntimeError("no such format"), ConfigError, "--json: cannot write a: no such format"),
+        (OSError(errno.ENOSPC, "No space left on device", "a"), OSError, "No space left on device"),
+        (ValueError("a bug"), ValueError, "a bug"),
+    ],
+)
+def test_errors_of_writing_name_the_option(error: Exception, kind: type[Exception], message: str) -> None:
+    with pytest.raises(kind, match=message) as found, writing("--json", Path("a")):
+        raise error
+    assert (found.value is error) is (kind is not ConfigError)
 
 
 def test_a_file_of_json_is_written_through_a_link(tmp_path: Path) -> None:

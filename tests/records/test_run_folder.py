@@ -25,7 +25,7 @@ from reslrb_cli.records import manifest as manifests
 from reslrb_cli.records.decisions import CACHE_FILE, MOST, Decision, DecisionCache, cache_folder, key_of
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.manifest import MANIFEST_FILE, Manifest, Status, read_manifest
-from reslrb_cli.records.run_folder import RunFolder, check_output, exposed, link_latest, opened
+from reslrb_cli.records.run_folder import RunFolder, check_output, check_writable, exposed, link_latest, opened
 
 # Run folders: their names, and that no half-made folder remains.
 
@@ -157,6 +157,28 @@ def test_a_full_disk_is_not_blamed_on_the_configuration(tmp_path, monkeypatch):
     with pytest.raises(MachineError, match="no run folder was made"):
         create(tmp_path)
     assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "kind", "message"),
+    [
+        (errno.ENOSPC, MachineError, "run: No space left on device; nothing of the run was changed"),
+        (errno.EROFS, ConfigError, r"run: cannot be written to \(Read-only file system\); copy it to another place"),
+    ],
+)
+def test_a_folder_that_cannot_be_written_to_is_not_continued(tmp_path, monkeypatch, number, kind, message):
+    folder = create(tmp_path)
+    (folder.path / "images").rmdir()
+    (folder.path / ".x.1.part").write_text("")
+    check_writable(folder)
+    assert names(folder.path) == ["checkpoint", "config.yaml", "images", "manifest.json", "parameters"]
+
+    def fail(folder):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("reslrb_cli.records.metrics.mend", fail)
+    with pytest.raises(kind, match=message):
+        check_writable(folder)
 
 
 def test_without_locks_runs_still_work(tmp_path, monkeypatch):
