@@ -299,7 +299,9 @@ def check_grazing() -> None:
     """
     case = BY_NAME["bumpy-area-2"]
     column = case.motion.index("seen")
-    agreement = compare(replace(case, spp=2048).gradients()[:, [column]], recorded(case)[:, [column]], block=None)
+    # Many seeds of few samples know their noise better than few seeds of many samples.
+    found = replace(case, spp=192).gradients(32)
+    agreement = compare(found[:, [column]], recorded(case)[:, [column]], block=None)
     assert agreement, agreement
 
 
