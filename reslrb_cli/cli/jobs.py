@@ -109,7 +109,7 @@ class Jobs:
         if not self._free or not at_work:
             return not at_work
         self._has_begun = self._has_begun or any(slot.line for slot in at_work)
-        coming = sum(max(self._peak - slot.resident, 0) for slot in at_work)
+        coming = sum(self._peak - slot.resident for slot in at_work)
         return self._has_begun and free_bytes("llvm") >= coming + self._peak
 
     def start(self, name: str, call: Callable[[RunSlot], End]) -> None:

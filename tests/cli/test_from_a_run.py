@@ -18,10 +18,11 @@ from turns import a_few
 
 import reslrb_cli as rl
 from reslrb_cli.api.experiment import called
-from reslrb_cli.cli.render import check_image_path
+from reslrb_cli.cli.render import _of_sensor, check_image_path
 from reslrb_cli.config.loader import Override, load
 from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.optimization import loading
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
@@ -335,6 +336,19 @@ def test_the_line_with_the_exposures(monkeypatch: pytest.MonkeyPatch, found: dic
     monkeypatch.setattr(export, "exposures", lambda run: found)
     said = "" if words is None else f"multiply renderings by the exposure, {words}, to match the photographs"
     assert export.exposure_line(Path("run")) == said
+
+
+@pytest.mark.parametrize(("sensor", "lamps"), [(0, ["lamp"]), (2, None), (5, None)])
+def test_one_view_keeps_its_lamps(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, sensor: int, lamps: list[str] | None
+) -> None:
+    monkeypatch.setattr(loading, "read_sensor_ids", lambda config: ["a", "b", "c"])
+    monkeypatch.setattr(loading, "view_sensors", lambda config, ids: [0, 2])
+    views = "views=[{sensor: 0, lamps: [lamp]}, {sensor: 2}]"
+    config = load(folder / "tiny.yaml", [views, "run.held_out=[1]", "target.exposure=2", "run.views_per_iteration=1"])
+    found = _of_sensor(config, sensor)
+    assert [(view.sensor, view.lamps) for view in found.views or ()] == [(sensor, lamps)]
+    assert (found.target.exposure, found.run.held_out, found.run.views_per_iteration) == (1.0, [], None)
 
 
 @pytest.mark.parametrize(

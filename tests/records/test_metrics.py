@@ -10,12 +10,16 @@ import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from cli.tiny import read_metrics
 
 from reslrb_cli.errors import ConfigError
+from reslrb_cli.records import clock as clocks
 from reslrb_cli.records.checkpoint import save_checkpoint
 from reslrb_cli.records.clock import summarise
 from reslrb_cli.records.manifest import versions
@@ -200,6 +204,21 @@ def test_costs_of_regularizers_are_the_last_ones_and_held_heights_are_counted():
     assert str(tally) == (
         "beside the loss: smooth of face 0.125, heights held at the least thickness in 2 iterations (3 at last)"
     )
+
+
+def test_a_clock_adds_up_its_steps_and_counts_new_kernels(llvm, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(clocks, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    clock, found = clocks.StepClock(10.0), []
+    for factor, seconds in ((2, 1.0), (2, 2.0), (3, 4.0)):
+        with clock.step() as times:
+            now[0] += seconds
+            dr.eval(dr.arange(mi.Float, 7 + factor) * factor)
+        found.append((times.wall_ms, times.new_kernels, len(clock.history)))
+    with clock.counted():
+        now[0] += 8
+    assert found == [(1000.0, 1, 1), (2000.0, 0, 1), (4000.0, 1, 1)]
+    assert clock.elapsed_s == 25.0
 
 
 def test_compilation_counts_as_code_generation():

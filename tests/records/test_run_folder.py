@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -262,6 +263,20 @@ def test_a_continued_run_is_running(tmp_path):
     with FolderLock(tmp_path):
         assert read_manifest(tmp_path)["status"] == "running"
     assert stored(tmp_path)["status"] == "running"
+
+
+def test_a_reader_leaves_a_folder_to_others(tmp_path, monkeypatch):
+    """A process that holds the lock, or that has just written the manifest, mends it itself."""
+    abandoned(tmp_path)
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_SH)
+    assert read_manifest(tmp_path)["status"] == "interrupted"
+    assert stored(tmp_path)["status"] == "running"
+    os.close(descriptor)
+    contents = [stored(tmp_path), stored(tmp_path) | {"seed": 4}]
+    monkeypatch.setattr(manifests, "read_content", lambda folder: contents.pop(0))
+    assert read_manifest(tmp_path)["status"] == "interrupted"
+    assert (stored(tmp_path)["status"], contents) == ("running", [])
 
 
 def test_a_reader_without_write_permission_sees_the_same(tmp_path, monkeypatch):

@@ -205,6 +205,7 @@ def test_variants_without_wavelengths_have_the_index_at_d(llvm: str) -> None:
         ({"nd": 1.5}, "both `nd` and `Vd`"),
         ({"nd": 0.9, "Vd": 50.0}, "nd above 1"),
         ({"sellmeier": "1, 2, 3"}, "as many coefficients B as C"),
+        ({"sellmeier": " "}, "as many coefficients B as C"),
         ({"material": "F2", "sellmeier": "1, 0.1"}, "remove one"),
         ({"sellmeier": "1, 0.2"}, "pole at a visible wavelength"),
         ({"sellmeier": "1, 3"}, "not above 1"),

@@ -633,6 +633,11 @@ def test_a_wrong_pixel_is_located_and_pixels_are_counted_once(tmp_path):
         read_image(tmp_path / "a.exr")
 
 
+def test_a_pixel_is_clipped_if_one_channel_is(tmp_path):
+    write(tmp_path / "a.png", np.uint8([[[255, 0, 0], [254, 254, 254], [255, 255, 255], [0, 0, 0]]]))
+    assert read_photo(tmp_path / "a.png").clipped.tolist() == [[True, False, True, False]]
+
+
 @pytest.mark.parametrize("restart", range(0xD0, 0xD8))
 def test_every_restart_of_a_jpeg_is_skipped(restart):
     start = bytes([0xFF, 0xD8, 0xFF, 0xE0, 0, 4, 0xFF, 0xD9])  # the end inside of a segment does not count

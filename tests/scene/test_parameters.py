@@ -275,7 +275,7 @@ def with_bsdf(make_scene, **bsdf):
     ({"type": "mask", "opacity": 1.0, "inside": {"type": "diffuse"}}, "opacity.value", None, 0.999),
 ])  # fmt: skip
 def test_starts_and_bounds_are_where_a_derivative_exists(make_scene, caplog, bsdf, key, given, starts):
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", "reslrb_cli")
     spec = {"key": f"plane.bsdf.{key}"} | ({} if given is None else {"initial": given})
     selection = select(with_bsdf(make_scene, **bsdf), spec)
     assert selection.array(spec["key"]) == pytest.approx(starts)
