@@ -140,6 +140,7 @@ def test_usage_errors_are_one_line(args: list[str], line: str) -> None:
     [
         (True, True, {BenchStatus.OK}, ExitCode.INTERRUPTED),
         (False, True, {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}, ExitCode.DONE),
+        (False, True, {BenchStatus.OUT_OF_MEMORY}, ExitCode.DONE),
         (False, False, {BenchStatus.OUT_OF_MEMORY}, ExitCode.OUT_OF_MEMORY),
         (False, False, {BenchStatus.FAILED, BenchStatus.OUT_OF_MEMORY}, ExitCode.CHECK_FAILED),
         (False, False, set(), ExitCode.CHECK_FAILED),

@@ -100,7 +100,9 @@ def optimize(*args: str) -> int:
     """Run `reslrb optimize` in this process, and return its exit code."""
     with pytest.raises(SystemExit) as end:
         main.main(["optimize", *args])
-    logging.getLogger("reslrb_cli").handlers.clear()
+    logger = logging.getLogger("reslrb_cli")
+    logger.handlers.clear()
+    logger.setLevel(logging.NOTSET)
     return int(end.value.code or 0)
 
 

@@ -27,7 +27,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.run_folder import read_config, read_value
-from reslrb_cli.runs import prepare, resume
+from reslrb_cli.runs import prepare, recorder, resume
 from reslrb_cli.runs.prepare import moves
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
@@ -120,6 +120,13 @@ def test_the_previous_state_is_used_and_reported(run: Path, capsys: pytest.Captu
     assert int(state_of(run)["iteration"]) == 6
     with np.load(run / PREVIOUS) as previous:  # not the damaged state
         assert int(previous["iteration"]) == 5
+
+
+def test_a_continued_run_that_stops_at_once_keeps_both_states(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    records = recorder.Recording.records
+    monkeypatch.setattr(recorder.Recording, "records", lambda self, stop: records(self, lambda: True))
+    assert optimize("--resume", str(run), "--quiet") == 130
+    assert [int(read_state(run / name)[0]["iteration"]) for name in (PREVIOUS, STATE)] == [3, 4]
 
 
 def test_a_missing_state_is_reported(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
