@@ -141,7 +141,3 @@ def test_lines_that_are_too_fine_for_a_floor_end_before_the_last_grid(monkeypatc
     assert made.heights.shape == (48, 48)
     assert stages.count("grid of 24x24") == 2
     assert stages.count("grid of 48x48") == 1
-    stages.clear()
-    monkeypatch.setattr(transport, "least_floor", lambda *_: 0.1)
-    np.testing.assert_array_equal(shape_surface(sharp(64), Setting(), 48, tell=stages.append).heights, made.heights)
-    assert stages.count("grid of 24x24") == 1

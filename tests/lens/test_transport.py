@@ -82,6 +82,23 @@ def test_the_derivative_of_the_equation_matches_differences(optics: type[Gradien
     assert np.sqrt(np.mean(difference**2)) < 0.03 * np.sqrt(np.mean(expected**2))
 
 
+@pytest.mark.parametrize(("fails", "sharp", "side"), [(16, True, 64), (32, True, 32), (32, False, 64), (64, True, 64)])
+def test_a_picture_that_stays_blurred_ends_before_the_last_grid(
+    monkeypatch: pytest.MonkeyPatch, fails: int, sharp: bool, side: int
+) -> None:
+    """Only the grid before the last one tells: a coarser one may fail although the finer ones do not."""
+
+    def newton(state: transport._State, *_: object, blur: float = 0.0) -> None:
+        state.residual = float(state.h.shape[0] == fails and blur < 2)
+
+    monkeypatch.setattr(transport, "_newton", newton)
+    square = (1.0, 1.0)
+    made = solve(Gradient(np.ones((2, 2)), square), smooth(64), square, square, (64, 64), even(square, square),
+                 sharp=sharp)  # fmt: skip
+    assert made.h.shape == (side, side)
+    assert made.converged == (side == 64)
+
+
 def test_the_slope_of_the_picture_is_that_between_pixels() -> None:
     size, target = (1.0, 1.0), (1.2, 0.9)
     start = even(size, target)
