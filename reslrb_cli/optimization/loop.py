@@ -204,7 +204,7 @@ def measure_block(problem: Problem, iteration: int) -> None:
     if paid is None:
         return
     part = max(int(part * paid / cost) // unit, 1) * unit
-    curvature = LossCurvature(problem, part, of_target=False)
+    curvature = LossCurvature(problem, part, of_target=False, round=iteration)
     directions, *_ = curvature.along(changes, lambda: True)
     # A texture has no entries, but channels.
     at = np.array([block.at[each.key].start + (each.entry or each.channel or 0) for each in directions])

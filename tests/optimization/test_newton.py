@@ -642,7 +642,7 @@ def test_the_first_measurement_fits_its_budget(directions, samples, tmp_path, mo
     """Its two sets of images have at most the samples of 20 steps. Without time for one sample, it waits."""
     problem, used = make_problem(tmp_path, sets=[AUTO, "run.spp=64"]), []
 
-    def measure(problem, spp, of_target):
+    def measure(problem, spp, **given):
         used.append(spp)
         raise LookupError
 

@@ -69,8 +69,8 @@ MOST_VALUES = 2**18
 REPLICAS, AGAIN = 4, 4
 #: Maximum factor by which they are made brighter or darker.
 MOST_ASTRAY = 10.0
-#: Samples for probes of large parameters.
-PROBED = 2
+#: Samples for probes of large parameters, and the number of the first sample for products.
+PROBED, FIRST_PRODUCT = 2, 1000
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,15 @@ class ParameterDirection:
     """One coordinate. `vector` is the change of the parameter `key` per unit, in the layout of a flat gradient.
 
     `channel` is the only image channel that the direction changes, or None. `entry` is the entry of a small parameter.
-    `entry` is None if all entries of a texture's channel change together, in proportion to their values.
+    `entry` is None if all entries of a texture's channel change together, in proportion to their values. `partner` is
+    the texture whose entries compensate for the change of a small parameter (`coupling.py`).
     """
 
     key: str
     vector: Array
     channel: int | None = None
     entry: int | None = None
+    partner: str | None = None
 
 
 @dataclass(frozen=True)
@@ -250,13 +252,14 @@ def _correlation(one: Array, other: Array) -> Array:
 class LossCurvature:
     """Measurement of the curvature at the current values of `problem`. The problem needs its targets.
 
-    There are two sets of samples, each with `spp` samples per pixel. `of_target` includes the noise of the target.
+    There are two sets of samples, each with `spp` samples per pixel. Measurements with different numbers `round` have
+    independent samples. `of_target` includes the noise of the target.
     """
 
-    def __init__(self, problem: Problem, spp: int, of_target: bool = True) -> None:
-        self.problem, self.spp = problem, spp
+    def __init__(self, problem: Problem, spp: int, of_target: bool = True, round: int = 0) -> None:
+        self.problem, self.spp, self.round = problem, spp, round
         self.integrator = unrecorded(problem.integrator)
-        self._base = [see_images(problem, spp, -1 - half, _PURPOSE) for half in (0, 1)]
+        self._base = self._images()
         self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
         values = sum(weight.size for weight in self._weights)
         random = np.random.default_rng(self._seed(0, 0))
@@ -266,6 +269,7 @@ class LossCurvature:
         self.sure = np.zeros(0)
         #: Derivatives (M, N) of all pixels along each direction, by each set of samples. The first set has the weights.
         self.slopes: tuple[Array, Array] = np.zeros((0, 0)), np.zeros((0, 0))
+        self._drawn = 0
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
 
@@ -282,16 +286,12 @@ class LossCurvature:
         for change in changes:
             if not go_on():
                 break
-            self.problem.selection.set_arrays(change.values)
-            images = [see_images(self.problem, self.spp, -1 - half, _PURPOSE) for half in (0, 1)]
-            self.problem.apply()
+            derivatives = self._derivatives(change)
             for direction in change.directions:
                 directions.append(direction)
                 even.append(0.0)
                 for half in (0, 1):
-                    views = zip(self.problem.trained, images[half], self._base[half], strict=True)
-                    changed = [view.blurred(finite(a - b)) / change.amount for view, a, b in views]
-                    slopes = [_of_channel(each, direction.channel) for each in changed]
+                    slopes = [_of_channel(each, direction.channel) for each in derivatives[half]]
                     columns[half].append(self._in_a_row(slopes))
                     pulls = [(n, each) for views in self.noises for n, each in zip(views, slopes, strict=True)]
                     if pulls:
@@ -310,6 +310,38 @@ class LossCurvature:
             return directions, H, np.zeros_like(H)
         a, b = (np.array(rows) for rows in odd)
         return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
+
+    def products(self, change: ParameterChange) -> list[dict[str, tuple[Array, Array]]]:
+        """Return the products of H and the directions of a change: two independent samples of all entries for each
+        parameter.
+        """
+        derivatives, found = self._derivatives(change), []
+        for direction in change.directions:
+            pair = []
+            for half in (0, 1):
+                self._drawn += 1
+                images = zip(self._weights, derivatives[half], strict=True)
+                gradients = [weight * _of_channel(image, direction.channel) for weight, image in images]
+                pair.append(self._probe(gradients, FIRST_PRODUCT + self._drawn))
+            found.append({key: (pair[0][key].astype(np.float64), pair[1][key].astype(np.float64)) for key in pair[0]})
+        return found
+
+    def _images(self) -> list[list[Array]]:
+        """Render all views at the current values of the scene, with each set of samples."""
+        return [see_images(self.problem, self.spp, -1 - 2 * self.round - half, _PURPOSE) for half in (0, 1)]
+
+    def _derivatives(self, change: ParameterChange) -> list[list[Array]]:
+        """Return the derivative of each view's exposed image (H, W, C) along a change, for each set of samples."""
+        self.problem.selection.set_arrays(change.values)
+        pairs = zip(self._images(), self._base, strict=True)
+        self.problem.apply()
+        return [
+            [
+                view.blurred(finite(a - b)) / change.amount
+                for view, a, b in zip(self.problem.trained, *pair, strict=True)
+            ]
+            for pair in pairs
+        ]
 
     def for_steps(self, directions: Sequence[ParameterDirection]) -> tuple[Array, float]:
         """Return H (M, M) along the directions of `along`, with eigenvalues of at least their standard errors, and the

@@ -14,6 +14,7 @@ from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
+from reslrb_cli.optimization.uncertainty.coupling import followed, free_entries, measure_maps, with_followed
 from reslrb_cli.optimization.uncertainty.curvature import (
     LossCurvature,
     ParameterDirection,
@@ -131,11 +132,18 @@ class Certainty:
                 seen = {direction.key for direction in directions if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
                 by_entry = curvature.by_entry(PROBES, go_on) if left else {}
+                measured = self._measured(gradients, iterations)
+                maps = measure_maps(curvature, STEP, MOST_MULTIPLE * config.run.spp, go_on)
+                alone = np.diag(H)
+                extra = followed(latest, plan, free_entries(measured), go_on)
+                if extra:
+                    again = LossCurvature(problem, spp, round=1)
+                    found = again.along([*plan, *extra], go_on)
+                    directions, alone, H, B = with_followed(found, len(directions), (directions, H, B))
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            measured = self._measured(gradients, iterations)
-            weighed = weigh(measured, directions, H, B, by_entry)
+            weighed = weigh(measured, directions, H, B, by_entry, alone, maps)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
             return CertaintyRecord(

@@ -91,6 +91,17 @@ class Measured:
             found[group] = found[group].mean()
         return found
 
+    @cached_property
+    def in_blocks(self) -> tuple[Array, Array]:
+        """Means of consecutive gradients (B, N), and the distances (B, N) of their values from the final values: the
+        gradients of `rows` and those at the final values in `BLOCKS` blocks, or the K gradients at the final values.
+        """
+        if self.rows is None:
+            return self.gradients, np.zeros_like(self.gradients)
+        rows = np.concatenate([self.rows, [[g, self.value] for g in self.gradients]])
+        gradients, values = np.array([part.mean(axis=0) for part in np.array_split(rows, BLOCKS)]).swapaxes(0, 1)
+        return gradients, values - self.value
+
     @property
     def prior(self) -> float:
         """Standard deviation of an entry's offset at the start. For a parameter with bounds, the standard deviation is
@@ -195,11 +206,14 @@ def spread_of(to_go: Array, error: Array, of_target: Array) -> Array:
     return np.sqrt(np.maximum(to_go**2, error**2) + of_target**2)
 
 
-def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixed: Array) -> Posterior:
+def joint(
+    gradients: Array, offsets: Array, scale: Array, curvature: Array, fixed: Array, own: Array | None = None
+) -> Posterior:
     """Return the joint offset of M directions.
 
     `gradients` (n, M) are the gradients, and `offsets` (n, M) the distances of their values from the final values.
     `scale` (M,) is the standard deviation of the offset at the start, `curvature` is H (M, M), and `fixed` is B (M, M).
+    `own` (M,) is the curvature along each direction if nothing else moves; by default, the diagonal of H.
     The computation expresses each direction in units of its scale. Matrices of directions with different units are
     therefore well-conditioned.
     """
@@ -213,7 +227,8 @@ def joint(gradients: Array, offsets: Array, scale: Array, curvature: Array, fixe
     to_go, C = gain @ blocks.mean(axis=0), positive(one - gain @ H)
     pulled = to_go + gain @ H @ (offsets.mean(axis=0) / scale)
     of_target = np.minimum(np.sqrt(np.maximum(np.diag(gain @ B @ gain.T), 0.0)), 1.0)
-    alone = 1 / np.sqrt(1 + np.diag(H) ** 2 / np.maximum(np.diag(V), 1e-300))
+    h = np.diag(H) if own is None else own * scale**2
+    alone = 1 / np.sqrt(1 + h**2 / np.maximum(np.diag(V), 1e-300))
     return Posterior(
         to_go * scale,
         np.sqrt(np.diag(C)) * scale,

@@ -41,9 +41,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reslrb_cli.optimization.uncertainty.coupling import Maps
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.posterior import (
-    BLOCKS,
     CURVATURE_ERROR,
     SURE,
     TOLERANCE,
@@ -198,9 +198,14 @@ class Judged:
 
 
 def judge_together(
-    measured: Mapping[str, Measured], directions: Sequence[ParameterDirection], curvature: Array, fixed: Array
+    measured: Mapping[str, Measured],
+    directions: Sequence[ParameterDirection],
+    curvature: Array,
+    fixed: Array,
+    own: Array | None = None,
 ) -> Judged:
     """Judge all directions in one joint posterior. `curvature` is H (M, M), and `fixed` is the target noise B (M, M).
+    `own` (M,) is the curvature along each direction if no texture follows.
 
     Entries at their bounds, or without effect, count as known.
     """
@@ -215,10 +220,10 @@ def judge_together(
     gradients, offsets = (np.array(part).T for part in zip(*series, strict=True))
     scale = np.array([1.0 if each.entry is None else measured[each.key].prior for each in chosen])
     free = np.ix_(at, at)
-    posterior = joint(gradients, offsets, scale, curvature[free], fixed[free])
+    posterior = joint(gradients, offsets, scale, curvature[free], fixed[free], None if own is None else own[at])
     correlation = np.abs(posterior.covariance) / np.maximum(np.outer(posterior.error, posterior.error), 1e-300)
     for row, place in zip(correlation, at, strict=True):
-        partners[place] = _partner(row, place, at, directions)
+        partners[place] = _partner(row, place, at, directions) or directions[place].partner
     return Judged(posterior, {place: row for row, place in enumerate(at)}, partners)
 
 
@@ -258,19 +263,30 @@ def weigh(
     curvature: Array,
     fixed: Array,
     by_entry: Mapping[str, EntryCurvature],
+    own_curvature: Array | None = None,
+    maps: Sequence[Maps] = (),
 ) -> dict[str, ParameterCertainty]:
     """Return the certainty of each parameter, from the curvature along directions and, for large parameters, the
     curvature of each entry.
 
-    `fixed` is the target noise B (M, M), in the same directions as `curvature`.
+    `fixed` is the target noise B (M, M), in the same directions as `curvature`. `own_curvature` (M,) is the curvature
+    along the directions if no texture follows. `maps` are textures of the same shape.
     """
-    found, result = judge_together(measured, directions, curvature, fixed), {}
+    found, result = judge_together(measured, directions, curvature, fixed, own_curvature), {}
+    groups = {key: _groups(own, by_entry[key]) for key, own in measured.items() if key in by_entry}
+    others: dict[str, tuple[Array, str | None]] = {}
+    for each in maps:
+        keys = {key for key, _ in each.names}
+        known = keys & set(by_entry)
+        noise = dict.fromkeys(keys, 0.0) | {key: by_entry[key].mean_of_target(_free(measured[key])) for key in known}
+        left = each.undetermined(measured, noise)
+        others |= {key: (left[key], each.partner(key)) for key in keys}
     for key, own in measured.items():
         at = [place for place, direction in enumerate(directions) if direction.key == key]
         if at and directions[at[0]].entry is not None:
             result[key] = _small(own, at, found)
         else:
-            result[key] = _large(own, by_entry.get(key), at, found)
+            result[key] = _large(own, groups.get(key, []), at, found, *others.get(key, (None, None)))
     moving = {key for key, about in result.items() if about.verdict == ParameterVerdict.STILL_MOVING.value}
     for place, direction in enumerate(directions):
         about = result[direction.key]
@@ -302,17 +318,20 @@ def _small(own: Measured, at: Sequence[int], found: Judged) -> ParameterCertaint
     return _certainty(verdict, verdicts, partner, *parts)
 
 
-def _large(own: Measured, by_entry: EntryCurvature | None, at: Sequence[int], found: Judged) -> ParameterCertainty:
+def _large(
+    own: Measured, rows: Sequence[Group], at: Sequence[int], found: Judged, left: Array | None, other: str | None
+) -> ParameterCertainty:
     """Judge the entries of a large parameter in groups. Another parameter may still compensate for the offset of the
-    whole parameter.
+    whole parameter. The mean square offset `left` (N,) of single entries is undetermined, because the map `other`
+    compensates for it.
     """
-    shape, seen = own.value.shape, True if own.seen is None else own.seen
-    kept = own.touched & seen & ~own.at_bound
-    groups = [] if by_entry is None else own.groups(kept)
-    rows = [] if by_entry is None else _groups(own, groups, by_entry)
+    shape, kept = own.value.shape, _free(own)
     limit, limit_of_run, known = np.full((3, *shape), np.inf)
     spread, pulled = np.zeros(shape), np.zeros(shape, dtype=bool)
-    for group, each in zip(groups, rows, strict=True):
+    if left is not None:
+        rows = [replace(each, unknown=each.unknown + max(float(left[each.entries].mean()), 0.0)) for each in rows]
+    for each in rows:
+        group = each.entries
         limit[group], limit_of_run[group], pulled[group] = each.limit, each.limit_of_run, each.is_pulled
         spread[group], known[group] = each.spread, each.known
     tolerance = np.full(shape, own.tolerance(rms(own.value[kept]) if kept.any() else 0.0))
@@ -323,7 +342,8 @@ def _large(own: Measured, by_entry: EntryCurvature | None, at: Sequence[int], fo
         verdicts = [ParameterVerdict.SETTLED if free else v for free, v in zip(kept, verdicts, strict=True)]
     if own.seen is not None:
         verdicts = [v if seen else ParameterVerdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
-    verdict, partner = summarise(shares(verdicts)), None
+    verdict = summarise(shares(verdicts))
+    partner = other if verdict is ParameterVerdict.NOT_DETERMINED else None
     for place in at if verdict in (ParameterVerdict.SETTLED, ParameterVerdict.BELOW_NOISE) else ():
         name, row = found.partners[place], found.places.get(place)
         if name is not None and row is not None and found.posterior is not None:
@@ -338,13 +358,13 @@ def _large(own: Measured, by_entry: EntryCurvature | None, at: Sequence[int], fo
 
 @dataclass(frozen=True)
 class Group:
-    """Estimate for a group of `count` entries: the mean square of their offsets, its standard error, and the mean
-    square of the part that comes from the target. `unknown` is the mean square of the part that images do not
-    determine. `is_pulled` is true if the entries are on their way. `noise` is the mean square of the error of the mean
-    offsets, if they were measured by gradients that have moved the values.
+    """Estimate for a group of entries with the indices `entries`: the mean square of their offsets, its standard error,
+    and the mean square of the part that comes from the target. `unknown` is the mean square of the part that images do
+    not determine. `is_pulled` is true if the entries are on their way. `noise` is the mean square of the error of the
+    mean offsets, if they were measured by gradients that have moved the values.
     """
 
-    count: int
+    entries: Array
     square: float
     error: float
     of_target: float
@@ -380,31 +400,33 @@ class Group:
         """Return the estimate for all entries of some groups, or None without groups."""
         if not groups:
             return None
-        counts = np.array([each.count for each in groups])
+        counts = np.array([each.entries.size for each in groups])
         rows = np.array([(each.square, each.of_target, each.unknown, each.noise, each.error) for each in groups])
         square, of_target, unknown, noise, _ = counts @ rows / counts.sum()
         error = float(np.linalg.norm(counts * rows[:, -1]) / counts.sum())
-        return Group(int(counts.sum()), float(square), error, float(of_target), float(unknown), noise=float(noise))
+        entries = np.concatenate([each.entries for each in groups])
+        return Group(entries, float(square), error, float(of_target), float(unknown), noise=float(noise))
 
 
-def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) -> list[Group]:
-    """Estimate the offsets of the entries of each group. They are as large as at the start if noise hides the
-    curvature.
+def _free(own: Measured) -> Array:
+    """Return the entries (N,) that are visible, have a gradient, and are not at a bound."""
+    return np.asarray(own.touched & (True if own.seen is None else own.seen) & ~own.at_bound)
+
+
+def _groups(own: Measured, by_entry: EntryCurvature) -> list[Group]:
+    """Estimate the offsets of the free entries of a large parameter in groups. They are as large as at the start if
+    noise hides the curvature.
     """
-    if not groups:
+    if not (groups := own.groups(_free(own))):
         return []
     inside = np.isin(np.arange(own.value.size), np.concatenate(groups))
-    gradients, moved = own.gradients, 0.0
-    if own.rows is not None:  # as in `joint`
-        rows = np.concatenate([own.rows, [[g, own.value] for g in own.gradients]])
-        gradients, values = np.array([part.mean(axis=0) for part in np.array_split(rows, BLOCKS)]).swapaxes(0, 1)
-        moved = values - own.value
+    gradients, moved = own.in_blocks
     offsets, h, unknown = by_entry.solve(np.where(inside, gradients, 0.0), groups)
     offsets = offsets - moved
     found = []
     for group in groups:
         if h[group[0]] <= 0:
-            found.append(Group(len(group), 0.0, 0.0, 0.0, own.prior**2))
+            found.append(Group(group, 0.0, 0.0, 0.0, own.prior**2))
             continue
         square, error = pooled(offsets[:, group])
         way, left = (own.value - own.start)[group], offsets[:, group].mean(axis=0)
@@ -414,7 +436,7 @@ def _groups(own: Measured, groups: Sequence[Array], by_entry: EntryCurvature) ->
         halves = [half.mean(axis=0) for half in np.array_split(offsets[:, group], 2)]
         noise = 0.0 if own.rows is None else float(np.mean((halves[0] - halves[1]) ** 2)) / 4
         is_pulled = bool(square > SURE * error and cosine > ON_THE_WAY)
-        found.append(Group(len(group), square, error, of_target, unknown * own.prior**2, is_pulled, noise))
+        found.append(Group(group, square, error, of_target, unknown * own.prior**2, is_pulled, noise))
     return found
 
 

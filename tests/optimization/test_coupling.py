@@ -1,0 +1,217 @@
+"""Textures that compensate for small parameters or for each other: simulated maps with known errors, and runs on two
+small scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from kit import area, scene, sensor, shape
+from optimization.judged import CONFIG
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.uncertainty.coupling import (
+    MOST_NOISE,
+    Maps,
+    followed,
+    make_maps,
+    measure_maps,
+    with_followed,
+)
+from reslrb_cli.optimization.uncertainty.curvature import (
+    LossCurvature,
+    ParameterChange,
+    ParameterDirection,
+    plan_changes,
+    row_of,
+)
+from reslrb_cli.optimization.uncertainty.posterior import Measured
+from reslrb_cli.statistics import rms
+
+CELLS = 400
+KEYS = ("colour", "roughness", "metallic")
+#: The key of each map: a colour has three.
+CHANNELS = ("colour", "colour", "colour", "roughness", "metallic")
+
+
+SIGMA, PRIOR, COUNT = 0.05, 12**-0.5, 4
+PLACES = {key: np.nonzero(np.equal(CHANNELS, key))[0] for key in KEYS}
+
+
+def by_key(rows: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the entries of each parameter from the last two axes of `rows` (..., n, K) as flat arrays."""
+    return {key: rows[..., maps].reshape(*rows.shape[:-2], -1) for key, maps in PLACES.items()}
+
+
+def simulate(observations: int, noise: float) -> tuple[Maps, dict[str, Measured], dict[str, float]]:
+    """Return maps of `CELLS` cells with an image of `observations` values each, their measurements, and the root mean
+    square error of each parameter. `noise` is the relative noise of one sample of M.
+    """
+    random, K = np.random.default_rng(0), len(CHANNELS)
+    J = random.normal(size=(CELLS, observations, K)) * np.exp(0.5 * random.normal(size=(CELLS, 1, 1)))
+    J *= np.array([1.0, 0.8, 0.9, 0.4, 0.6])
+    M = np.einsum("nok,nol->nkl", J, J)
+    covariance = np.linalg.inv(M / SIGMA**2 + np.eye(K) / PRIOR**2)
+    errors = np.array([random.multivariate_normal(np.zeros(K), each) for each in covariance])
+    image = np.einsum("nok,nk->no", J, errors) + SIGMA * COUNT**0.5 * random.normal(size=(COUNT, CELLS, observations))
+    gradients, value = by_key(np.einsum("nok,bno->bnk", J, image)), by_key(np.full((CELLS, K), 0.5))
+    size = np.sqrt(np.einsum("nkk->nk", M))
+    samples = M + noise * (size[:, :, None] * size[:, None, :]) * random.normal(size=(2, *M.shape))
+    cells = {key: (np.tile(maps, CELLS), np.repeat(np.arange(CELLS), len(maps))) for key, maps in PLACES.items()}
+    names = [(key, number) for key, maps in PLACES.items() for number in range(len(maps))]
+    found = make_maps(names, 0.5 * (samples + samples.swapaxes(2, 3)), np.full((CELLS, K), 0.5), cells)
+    measured = {
+        key: Measured(value[key], (0.0, 1.0), 0.5, gradients[key], value[key], False, value[key]) for key in KEYS
+    }
+    return found, measured, {key: rms(row) for key, row in by_key(errors).items()}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.3])
+@pytest.mark.parametrize(("observations", "is_determined"), [(2, False), (3, False), (4, False), (8, True), (24, True)])
+def test_the_spread_of_maps_contains_what_other_maps_make_up_for(observations, is_determined, noise):
+    """Five unknown values of a cell need at least five observations."""
+    maps, measured, errors = simulate(observations, noise)
+    left = maps.undetermined(measured, dict.fromkeys(KEYS, 0.0))
+    for key in KEYS:
+        h = np.einsum("nkk->nk", maps.matrix)[:, PLACES[key]]
+        alone = np.sqrt(np.mean(1 / (h / SIGMA**2 + 1 / PRIOR**2)))  # if the other maps were known
+        spread = np.sqrt(alone**2 + left[key].mean())
+        assert errors[key] < (1.3 if noise <= MOST_NOISE else 1.4) * spread
+        if noise <= MOST_NOISE:  # more noise hides small eigenvalues, and spreads are too large
+            assert errors[key] > 0.6 * spread
+            assert (spread > 2 * alone) is not is_determined
+        assert maps.partner(key) in set(KEYS) - {key}
+
+
+def test_noise_of_the_measurement_couples_no_maps():
+    """The maps are independent, and the samples of M are mostly noise."""
+    random = np.random.default_rng(1)
+    M = np.eye(3) * np.exp(0.3 * random.normal(size=(CELLS, 1, 1)))
+    samples = M + random.normal(size=(2, *M.shape))
+    found = make_maps([], 0.5 * (samples + samples.swapaxes(2, 3)), np.ones((CELLS, 3)), {})
+    assert found.noise == pytest.approx(0.6, abs=0.1)
+    assert np.abs(found.matrix - np.eye(3)).mean() < 0.1
+    np.testing.assert_allclose(found.matrix, found.matrix.swapaxes(1, 2), atol=1e-12)
+
+
+def test_a_map_without_curvature_adds_nothing():
+    """Nothing is added to the spread of the other map, and nothing is divided by zero."""
+    M = np.zeros((2, CELLS, 2, 2))
+    M[:, :, 0, 0] = 4.0
+    places = {key: (np.full(CELLS, k), np.arange(CELLS)) for k, key in enumerate("ab")}
+    g, value = np.random.default_rng(2).normal(size=(4, CELLS)), np.full(CELLS, 0.5)
+    rows = {"a": g, "b": 0 * g}
+    measured = {key: Measured(value, (0.0, 1.0), 0.5, rows[key], value, False, value) for key in rows}
+    maps = make_maps([("a", 0), ("b", 0)], M, np.ones((CELLS, 2)), places)
+    left = maps.undetermined(measured, {"a": 0.0, "b": 0.0})
+    np.testing.assert_allclose([left["a"], left["b"]], 0.0, atol=1e-12)
+
+
+MIRROR = """<bsdf type="principled"><rgb name="base_color" value="0.8, 0.6, 0.6"/>
+    <float name="metallic" value="1"/><float name="roughness" value="0.05"/></bsdf>"""
+FLOOR, POSTER, TINT = "floor.bsdf.reflectance.data", "poster.bsdf.reflectance.data", "mirror.bsdf.base_color.value"
+
+
+def bitmap(name: str, file: str) -> str:
+    return (f'<texture type="bitmap" name="{name}"><string name="filename" value="{file}"/>'
+            '<boolean name="raw" value="true"/></texture>')  # fmt: skip
+
+
+def write(folder, text: str) -> None:
+    (folder / "scene.xml").write_text(text)
+    (folder / "toy.yaml").write_text(CONFIG)
+
+
+def write_map(folder, name: str, *size: int, low: float = 0.2, high: float = 0.8) -> None:
+    values = np.random.default_rng(len(name)).uniform(low, high, size).astype(np.float32)
+    mi.Bitmap(values).write(str(folder / name))
+
+
+def assembled(folder, keys: Sequence[str], *settings: str) -> Problem:
+    """Return the problem with the true values of the scene in `folder`, and with targets."""
+    parameters = ", ".join(f"{{key: {key}, bounds: [0, 1]}}" for key in keys)
+    problem = assemble(load(folder / "toy.yaml", [f"parameters=[{parameters}]", "target.render.spp=64", *settings]))
+    problem.apply()
+    return problem
+
+
+@pytest.mark.parametrize("key", [FLOOR, POSTER])
+def test_texels_that_only_a_mirror_shows_make_up_for_its_tint(key, llvm, tmp_path):
+    """The image shows only their product. Texels beside the mirror, which the mirror does not show, change nothing."""
+    write_map(tmp_path, "floor.exr", 8, 8, 3)
+    textured = f'<bsdf type="diffuse">{bitmap("reflectance", "floor.exr")}</bsdf>'
+    write(tmp_path, scene(
+        sensor("0, 1, 3", "0, 0.5, 0" if key == FLOOR else "0, 1, 0", size=24, fov=30 if key == FLOOR else 45),
+        shape("rectangle", "mirror", MIRROR, place='<scale value="0.6"/><translate y="0.6" z="-0.8"/>'),
+        shape("rectangle", "floor", textured, place='<rotate x="1" angle="-90"/><scale value="4"/>'),
+        shape("rectangle", "poster", textured, place='<scale value="0.5"/><translate y="1.8" z="-0.8"/>'),
+        '<emitter type="constant"><rgb name="radiance" value="1"/></emitter>',
+    ))  # fmt: skip
+    problem = assembled(tmp_path, [key, TINT])
+    curvature, free = LossCurvature(problem, 256), {key: np.ones(192, dtype=bool)}
+    plan = plan_changes(problem, dict.fromkeys([key, TINT], 0.5), 0.05)
+    extra = followed(curvature, plan, free, lambda: True)
+    directions, H, B = LossCurvature(problem, 256, round=1).along([*plan, *extra], lambda: True)
+    before = directions[:6], H[:6, :6], B[:6, :6]
+    chosen, alone, left, _ = with_followed((directions, H, B), 6, before)
+    shares = np.diag(left)[:3] / alone[:3]
+    assert [each.partner for each in chosen[3:]] == [None] * 3
+    if key == FLOOR:
+        assert np.all(shares < 0.5), shares
+        assert [each.partner for each in chosen[:3]] == [FLOOR] * 3
+    else:
+        assert np.all(shares > 0.9), shares
+    # Without time for all products, less changes.
+    times = iter([True, True, False])
+    assert len(followed(curvature, plan, free, lambda: next(times))) == 1
+    assert followed(curvature, plan, free, lambda: False) == []
+    np.testing.assert_array_equal(with_followed(before, 6, before)[2], H[:6, :6])
+
+
+MAPS = {f"sample.bsdf.{name}.data": name for name in ("base_color", "roughness", "metallic")}
+
+
+def write_sample(folder, side: int, size: int) -> None:
+    for name, channels in zip(MAPS.values(), (3, 1, 1), strict=True):
+        write_map(folder, f"{name}.exr", side, side, channels)
+    textures = "".join(bitmap(name, f"{name}.exr") for name in MAPS.values())
+    write(folder, scene(
+        sensor("0, 3, 2.5", size=size, fov=40),
+        shape("rectangle", "sample", f'<bsdf type="principled">{textures}</bsdf>', place='<rotate x="1" angle="-90"/>'),
+        shape("rectangle", "lamp", area("12, 12, 12"),
+              place='<rotate x="1" angle="90"/><scale value="0.6"/><translate x="1" y="3"/>'),
+        '<emitter type="constant"><rgb name="radiance" value="0.3"/></emitter>',
+    ))  # fmt: skip
+
+
+def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path):
+    """The reference changes one texel at a time. A texel's curvature contains that of every second texel."""
+    write_sample(tmp_path, 3, 16)
+    keys = list(MAPS)[1:]
+    problem = assembled(tmp_path, keys)
+    (maps,) = measure_maps(LossCurvature(problem, 512), 0.05, 512, lambda: True)
+    assert maps.noise < MOST_NOISE
+    assert [name for name, _ in maps.names] == keys
+    half, values = np.indices((3, 3)).sum(axis=0).ravel() % 2, [row_of(problem, key) for key in keys]
+    changes = []
+    for key, value in zip(keys, values, strict=True):
+        for texel in range(9):
+            vector = np.eye(9)[texel] * value
+            changed = (value - 0.05 * vector).reshape(3, 3, 1)
+            changes.append(ParameterChange({key: changed}, -0.05, [ParameterDirection(key, vector)]))
+    curvature = LossCurvature(problem, 512, of_target=False, round=5)
+    curvature.along(changes, lambda: True)
+    a, b = curvature.slopes
+    H = 0.5 * (a @ b.T + b @ a.T).reshape(2, 9, 2, 9)
+    expected = np.einsum("kilj,ij->ikl", H, np.equal.outer(half, half).astype(float))
+    expected = 0.5 * (expected + expected.swapaxes(1, 2))
+    size = np.abs(np.array(values).T)
+    expected /= size[:, :, None] * size[:, None, :]
+    scale = np.sqrt(np.einsum("ikk->k", expected) / 9)
+    error = (maps.matrix - expected) / np.outer(scale, scale)
+    assert rms(error) < 2.5 * maps.noise, error
