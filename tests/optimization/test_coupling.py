@@ -5,6 +5,7 @@ small scenes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -24,6 +25,7 @@ from reslrb_cli.optimization.uncertainty.coupling import (
     with_followed,
 )
 from reslrb_cli.optimization.uncertainty.curvature import (
+    EntryCurvature,
     LossCurvature,
     ParameterChange,
     ParameterDirection,
@@ -31,6 +33,7 @@ from reslrb_cli.optimization.uncertainty.curvature import (
     row_of,
 )
 from reslrb_cli.optimization.uncertainty.posterior import Measured
+from reslrb_cli.optimization.uncertainty.verdicts import weigh
 from reslrb_cli.statistics import rms
 
 CELLS = 400
@@ -86,6 +89,31 @@ def test_the_spread_of_maps_contains_what_other_maps_make_up_for(observations, i
             assert errors[key] > 0.6 * spread
             assert (spread > 2 * alone) is not is_determined
         assert maps.partner(key) in set(KEYS) - {key}
+
+
+@pytest.mark.parametrize("observations", [3, 24])
+def test_verdicts_name_the_map_that_makes_up_for_another(observations):
+    maps, measured, _ = simulate(observations, 0.0)
+    by_entry = {key: EntryCurvature(np.einsum("nkk->nk", maps.matrix)[:, PLACES[key]].ravel(), None) for key in KEYS}
+    none = np.zeros((0, 0))
+    alone, found = (weigh(measured, [], none, none, by_entry, None, each) for each in ((), [maps]))
+    for key in KEYS:
+        assert alone[key].partner is None
+        assert found[key].spread[0] >= alone[key].spread[0]
+    judged = found["metallic"].verdict, found["metallic"].partner in ("colour", "roughness")
+    assert judged == (("not determined", True) if observations == 3 else ("settled", False))
+
+
+def test_a_texture_that_follows_makes_a_value_uncertain():
+    """Without the texture, the curvature of the value is 100. If the texture follows, it is almost zero."""
+    g = 0.1 * np.random.default_rng(5).normal(size=(12, 1))
+    own = {"tint": Measured(np.full(1, 0.5), (0.0, 1.0), 0.5, g, np.full(1, 1e-3), True, np.full(1, 0.3))}
+    one, zero = np.ones((1, 1)), np.zeros((1, 1))
+    alone = weigh(own, [ParameterDirection("tint", np.ones(1), None, 0)], 100 * one, zero, {})["tint"]
+    direction = ParameterDirection("tint", np.ones(1), None, 0, "floor")
+    found = weigh(own, [direction], 1e-3 * one, zero, {}, np.array([100.0]))["tint"]
+    assert (alone.verdict, found.verdict, found.partner) == ("settled", "not determined", "floor")
+    assert found.spread[0] > 100 * alone.spread[0]
 
 
 def test_noise_of_the_measurement_couples_no_maps():
@@ -157,8 +185,7 @@ def test_texels_that_only_a_mirror_shows_make_up_for_its_tint(key, llvm, tmp_pat
     plan = plan_changes(problem, dict.fromkeys([key, TINT], 0.5), 0.05)
     extra = followed(curvature, plan, free, lambda: True)
     directions, H, B = LossCurvature(problem, 256, round=1).along([*plan, *extra], lambda: True)
-    before = directions[:6], H[:6, :6], B[:6, :6]
-    chosen, alone, left, _ = with_followed((directions, H, B), 6, before)
+    chosen, alone, left, _ = with_followed((directions, H, B), 6)
     shares = np.diag(left)[:3] / alone[:3]
     assert [each.partner for each in chosen[3:]] == [None] * 3
     if key == FLOOR:
@@ -170,7 +197,12 @@ def test_texels_that_only_a_mirror_shows_make_up_for_its_tint(key, llvm, tmp_pat
     times = iter([True, True, False])
     assert len(followed(curvature, plan, free, lambda: next(times))) == 1
     assert followed(curvature, plan, free, lambda: False) == []
-    np.testing.assert_array_equal(with_followed(before, 6, before)[2], H[:6, :6])
+    np.testing.assert_array_equal(with_followed((directions[:6], H[:6, :6], B[:6, :6]), 6)[2], H[:6, :6])
+    # Entries whose curvature is mostly noise hardly follow.
+    rows = {key: (np.full(192, 1.0), np.full(192, -0.9))}
+    noisy = SimpleNamespace(problem=problem, products=lambda change: [rows] * len(change.directions))
+    (first, *_) = followed(noisy, plan, free, lambda: True)
+    assert 0 < np.abs(first.values[key] - problem.selection.array(key)).max() < 0.05 * first.amount
 
 
 MAPS = {f"sample.bsdf.{name}.data": name for name in ("base_color", "roughness", "metallic")}
@@ -194,7 +226,8 @@ def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path):
     write_sample(tmp_path, 3, 16)
     keys = list(MAPS)[1:]
     problem = assembled(tmp_path, keys)
-    (maps,) = measure_maps(LossCurvature(problem, 512), 0.05, 512, lambda: True)
+    (maps,), left = measure_maps(LossCurvature(problem, 512), 0.05, 512, lambda: True)
+    assert not left
     assert maps.noise < MOST_NOISE
     assert [name for name, _ in maps.names] == keys
     half, values = np.indices((3, 3)).sum(axis=0).ravel() % 2, [row_of(problem, key) for key in keys]

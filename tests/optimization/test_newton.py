@@ -639,18 +639,22 @@ def test_measuring_takes_at_most_its_share_of_the_samples(cost, fewest):
 
 @pytest.mark.parametrize(("directions", "samples"), [(10, 16), (39, 16), (79, 8), (400, 1), (4000, None)])
 def test_the_first_measurement_fits_its_budget(directions, samples, tmp_path, monkeypatch):
-    """Its two sets of images have at most the samples of 20 steps. Without time for one sample, it waits."""
+    """Its two sets of images have at most the samples of 20 steps. Without time for one sample, it waits. Each
+    iteration has samples of its own.
+    """
     problem, used = make_problem(tmp_path, sets=[AUTO, "run.spp=64"]), []
 
-    def measure(problem, spp, **given):
-        used.append(spp)
+    def measure(problem, spp, of_target, round):
+        used.append((spp, round))
         raise LookupError
 
     monkeypatch.setattr(loop, "plan_changes", lambda *given: [None] * directions)
     monkeypatch.setattr(loop, "LossCurvature", measure)
-    with contextlib.suppress(LookupError):
-        loop.measure_block(problem, 0)
-    assert used == ([] if samples is None else [samples])
+    for iteration in (0, 1):
+        with contextlib.suppress(LookupError):
+            loop.measure_block(problem, iteration)
+    assert used[:1] == ([] if samples is None else [(samples, 0)])
+    assert [round for _, round in used] == [0, 1][: len(used)]
     assert samples is None or 2 * (directions + 1) * samples <= loop.LEAST_ITERATIONS * 64
 
 

@@ -90,23 +90,18 @@ def followed(
 
 
 def with_followed(
-    found: tuple[list[ParameterDirection], Array, Array],
-    count: int,
-    before: tuple[list[ParameterDirection], Array, Array],
+    found: tuple[list[ParameterDirection], Array, Array], count: int
 ) -> tuple[list[ParameterDirection], Array, Array, Array]:
     """Return the directions, the diagonal of H without textures that follow, and H and B.
 
-    `found` has the `count` directions of `before`, and then those of `followed`. A direction is replaced by the one
-    that textures follow if its curvature is smaller. If directions are missing, the result is `before`.
+    `found` has `count` directions without textures that follow, and then those of `followed`. A direction is replaced
+    by the one that textures follow if its curvature is smaller.
     """
     directions, H, B = found
-    if len(directions) <= count:
-        return before[0], np.diag(before[1]), *before[1:]
     chosen = list(range(count))
+    places = {(each.key, each.entry): place for place, each in enumerate(directions[:count])}
     for place, direction in enumerate(directions[count:], count):
-        first = next(
-            k for k in range(count) if (directions[k].key, directions[k].entry) == (direction.key, direction.entry)
-        )
+        first = places[direction.key, direction.entry]
         if H[place, place] < H[first, first]:
             chosen[first] = place
     at = np.ix_(chosen, chosen)
@@ -215,30 +210,33 @@ def _mean_squares(precision: Array, pull: Array, prior: Array) -> Array:
     return np.minimum(np.maximum(offsets**2, np.einsum("nkk->nk", covariance)), prior**2)  # as in `spread_of`
 
 
-def measure_maps(curvature: LossCurvature, share: float, most: int, go_on: Callable[[], bool]) -> list[Maps]:
+def measure_maps(
+    curvature: LossCurvature, share: float, most: int, go_on: Callable[[], bool]
+) -> tuple[list[Maps], set[str]]:
     """Measure the maps of each shape that has several large parameters with common cells. Steps are `share` of the
-    values.
+    values. Also return the parameters of the shapes that `go_on` left out.
 
     The measurement is repeated with four times the samples, up to `most` samples per pixel, until the noise is small.
-    Otherwise, noise may hide small eigenvalues of M, and the spreads are too large.
+    More noise may hide small eigenvalues of M, and the spreads are then too large.
     """
-    problem, found, by_shape = curvature.problem, [], dict[str, list[str]]()
+    problem, found, left, by_shape = curvature.problem, list[Maps](), set[str](), dict[str, list[str]]()
     for key in problem.selection.keys:
         if key in problem.selection.params and not problem.optimizer.is_small(key):
             by_shape.setdefault(key.split(".")[0], []).append(key)
     for keys in by_shape.values():
-        places, latest = _cells(problem, keys), curvature
-        made = _measure(latest, places, share, go_on) if len(places) > 1 else None
-        while made is not None:
+        if len(places := _cells(problem, keys)) < 2:
+            continue
+        latest, best = curvature, None
+        while (made := _measure(latest, places, share, go_on)) is not None:
             best = made
-            if made.noise <= MOST_NOISE or 4 * latest.spp > most or not go_on():
-                found.append(best)
+            if made.noise <= MOST_NOISE or 4 * latest.spp > most:
                 break
-            latest = LossCurvature(problem, 4 * latest.spp, of_target=False, round=latest.round + 2)
-            made = _measure(latest, places, share, go_on)
-            if made is None:
-                found.append(best)
-    return found
+            latest = LossCurvature(problem, 4 * latest.spp, of_target=False, round=latest.round + 3)
+        if best is None:
+            left |= set(places)
+        else:
+            found.append(best)
+    return found, left
 
 
 def _cells(problem: Problem, keys: Sequence[str]) -> dict[str, tuple[Array, Array, Array]]:

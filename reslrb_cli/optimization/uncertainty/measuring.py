@@ -118,31 +118,35 @@ class Certainty:
                 most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
                 plan = plan_changes(problem, scales, STEP, most)
                 curvature = latest = LossCurvature(problem, spp)
-                directions, H, B = curvature.along(plan, go_on)
-                while hides(directions, H, latest.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp:
+                measured = self._measured(gradients, iterations)
+                found = curvature.along(plan, go_on)
+                maps, unknown = measure_maps(curvature, STEP, MOST_MULTIPLE * config.run.spp, go_on)
+                count, extra = len(found[0]), followed(curvature, plan, free_entries(measured), go_on)
+                if extra:
+                    again = LossCurvature(problem, spp, round=1)
+                    together = again.along([*plan, *extra], go_on)
+                    if len(together[0]) >= count:
+                        latest, found = again, together
+                while (
+                    hides(found[0][:count], found[1], latest.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp
+                ):
                     if not go_on.affords(PART * go_on.spent):
                         break
                     spp *= PART
-                    latest = LossCurvature(problem, spp)
-                    found = latest.along(plan, go_on)
-                    if len(found[0]) < len(directions):
+                    latest = LossCurvature(problem, spp, round=2)
+                    together = latest.along([*plan, *extra], go_on)
+                    if len(together[0]) < len(found[0]):
                         break
-                    directions, H, B = found
+                    found = together
                 # By entry, if a parameter has no directions for its entries.
-                seen = {direction.key for direction in directions if direction.entry is not None}
+                seen = {direction.key for direction in found[0] if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
                 by_entry = curvature.by_entry(PROBES, go_on) if left else {}
-                measured = self._measured(gradients, iterations)
-                maps = measure_maps(curvature, STEP, MOST_MULTIPLE * config.run.spp, go_on)
-                alone = np.diag(H)
-                extra = followed(latest, plan, free_entries(measured), go_on)
-                if extra:
-                    again = LossCurvature(problem, spp, round=1)
-                    found = again.along([*plan, *extra], go_on)
-                    directions, alone, H, B = with_followed(found, len(directions), (directions, H, B))
             compiled_ms += times.codegen_ms
             if stop():
                 return None
+            directions, alone, H, B = with_followed(found, count)
+            by_entry = {key: entries for key, entries in by_entry.items() if key not in unknown}
             weighed = weigh(measured, directions, H, B, by_entry, alone, maps)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
