@@ -77,6 +77,7 @@ WRONG: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
     "no history": ({"history/rate": None}, {}, "history/rate: is missing"),
     "too many iterations": ({}, {"iteration": 7}, "run.iterations: is 6; the run has done 7 already"),
     "a time": ({}, {"elapsed_s": "long"}, "elapsed_s: Input should be a valid number"),
+    "a number as text": ({}, {"elapsed_s": "1.5"}, "elapsed_s: Input should be a valid number"),
     "a decision": ({}, {"decisions": [{"setting": 3}]}, "decisions.0."),
     "an earlier version": ({}, {"format": 2}, "state: is of another version of reslrb"),
     "a later version": ({}, {"format": 99}, "state: is of another version of reslrb"),
