@@ -418,6 +418,11 @@ def test_open_variables_of_a_scene_are_named_and_can_be_set(choices: Path) -> No
     assert "at 16x16 pixels" in made.output
     assert '  # options: {side: 16, note: "a \\"b\\""}  # ' in (choices / "hall.yaml").read_text()
     (choices / "hall.yaml").unlink()
+    for length, listed in ((34, "note: {}"), (35, "...")):  # 40 characters, or more
+        (choices / "long.xml").write_text(CHOICES.replace("a &quot;b&quot;", length * "b"))
+        tiny.done("init", "long.xml", "-o", f"{length}.yaml")
+        found = listed.format(length * "b")
+        assert f"  # options: {{side: 16, {found}}}" in (choices / f"{length}.yaml").read_text()
     made = reslrb("init", "hall.xml", "--set", "scene.options.side=20")
     assert "at 20x20 pixels" in made.output
     assert load(choices / "hall.yaml").scene.options == {"side": 20}

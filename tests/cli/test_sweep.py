@@ -23,6 +23,8 @@ from kit import count_iterations, wait_for
 from reslrb_cli.cli import jobs, main, sweep
 from reslrb_cli.cli.optimize import Progress
 from reslrb_cli.cli.terminal import Interrupts
+from reslrb_cli.config.base import SEED_END
+from reslrb_cli.config.files import NAME_BYTES
 from reslrb_cli.config.loader import dump, load
 from reslrb_cli.errors import ConfigError, ExitCode
 from reslrb_cli.records import sweeps as plans_file
@@ -136,6 +138,8 @@ def test_names_are_short_safe_and_different(folder):
     text = json.dumps([{"a": value} for value in values], ensure_ascii=False).replace("\u202e", "\\u202e")
     scene = Path("scene.xml")
     scene.write_text(scene.read_text().replace("</scene>", '<string name="unused" value="$a"/></scene>'))
+    longest = len(plans._bounded("x" * 500)) + len(f"-{plans.MOST_RUNS}-seed={SEED_END}")
+    assert longest == NAME_BYTES
     plan = made(f"scene.options={text}")
     names = [each.name for each in plan.sweep.combinations]
     assert len({name.casefold() for name in names}) == len(values)
@@ -357,8 +361,12 @@ def test_a_failed_run_is_shown_in_its_row(folder, monkeypatch):
 
 @pytest.mark.parametrize("code", [6, 3, 130])
 def test_a_fault_outside_the_run_ends_the_sweep(folder, monkeypatch, code):
-    monkeypatch.setattr(sweep, "call", lambda *given, **options: (code, "the disk is full"))
+    pages = []
+    monkeypatch.setattr(
+        sweep, "call", lambda *given, **options: (pages.append(Path("s/sweep.html").exists()), (code, "full"))[1]
+    )
     result = reslrb("sweep", "tiny.yaml", "--vary", RATES, "-o", "s")
+    assert pages == [True]  # before the first run begins
     assert result.exit_code == code
     assert "--resume s" in result.output or code == 3
     assert read_sweep(Path("s")).failures == {}

@@ -169,6 +169,7 @@ LEFT_OUT = [
         "hdrfilm has no parameter `highQualityEdges` in Mitsuba 3",  # as in the file
     ),
     ("format", '<integer name="width" value="99"/>' + PARTS["format"], "`width` is given again in line 7"),
+    ("format", '<texture type="bitmap" name="width"/>' + PARTS["format"], "`width` is given again in line 7"),
     (
         "shape",
         PARTS["shape"].replace("<ref", '<float name="radios" value="3"/><ref'),
