@@ -49,7 +49,7 @@ from reslrb_cli.integrators.step import known_step
 from reslrb_cli.optimization.loading import make_configured, paths_of, render_in_passes
 from reslrb_cli.optimization.nonfinite import fill_gaps, finite
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.sensitivity import see_images, take_gradient, unrecorded
+from reslrb_cli.optimization.sensitivity import see_images, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, rms, scale_frequencies
@@ -258,7 +258,6 @@ class LossCurvature:
 
     def __init__(self, problem: Problem, spp: int, of_target: bool = True, round: int = 0) -> None:
         self.problem, self.spp, self.round = problem, spp, round
-        self.integrator = unrecorded(problem.integrator)
         self._base = self._images()
         self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
         values = sum(weight.size for weight in self._weights)
@@ -482,7 +481,7 @@ class LossCurvature:
             gradient = mi.TensorXf(v) + dr.opaque(mi.Float, 0)
             dr.make_opaque(gradient)
             known_step(
-                self.integrator, problem.scene, view.sensor, gradient, seed=self._seed(view.sensor, number),
+                problem.integrator, problem.scene, view.sensor, gradient, seed=self._seed(view.sensor, number),
                 spp=self.spp, params=problem.selection.params,
             )  # fmt: skip
         return take_gradient(problem)

@@ -50,8 +50,9 @@ MOST_LAST, MOST_RECORDED = 200, 2**22
 #: Maximum number of entries of a texture whose gradients and values are recorded. In larger textures, the gradients at
 #: the final values determine the mean square of the offsets as well, because there are so many entries.
 MOST_ROWS = 2**10
-#: Curvature that takes longer than this share of the run's iterations, and than this many of them, is left out.
-SHARE, MOST_STEPS = 0.25, 50
+#: Curvature that takes longer than this share of the run's iterations, this many of them, and this many seconds is left
+#: out.
+SHARE, MOST_STEPS, LEAST_SECONDS = 0.25, 50, 5.0
 
 
 class Certainty:
@@ -110,7 +111,7 @@ class Certainty:
                     take_gradient(problem)
                 compiled_ms += times.codegen_ms
             gradients = {key: fill_gaps(np.array(samples)) for key, samples in rows.items()}
-            go_on = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations), stop)
+            go_on = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations, LEAST_SECONDS), stop)
             with clock.step() as times:
                 unit = problem.samples_per_pass or 1
                 spp = max(max(config.run.spp // PART, min(config.run.spp, FEW)) // unit, 1) * unit
