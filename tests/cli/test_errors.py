@@ -16,6 +16,7 @@ from cli.tiny import SCENE, write_experiment
 
 from reslrb_cli.cli import _Main, main
 from reslrb_cli.cli.options import exit_code
+from reslrb_cli.cli.terminal import tell
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import (
@@ -364,3 +365,8 @@ def test_a_record_too_large_for_a_thread(experiment: Path, monkeypatch: pytest.M
 )
 def test_large_but_fitting_sizes_are_accepted(sets: list[str], experiment: Path) -> None:
     assert isinstance(load(experiment / "tiny.yaml", sets), Config)
+
+
+@pytest.mark.parametrize(("text", "said"), [("no file.", "no file."), ("no file", "no file."), ("why?", "why?")])
+def test_a_usage_error_ends_with_one_mark(text: str, said: str) -> None:
+    assert tell(click.UsageError(text)) == (f"reslrb: {said} See `reslrb --help`.", ExitCode.USAGE)

@@ -361,7 +361,7 @@ def test_each_run_has_a_gpu(folder, monkeypatch, four_cores):
     monkeypatch.delenv(jobs.GPUS, raising=False)
     assert [slot.gpu for slot in jobs.Jobs(2, "cuda_ad_rgb").slots] == ["GPU-a", "GPU-b"]
     assert [slot.gpu for slot in jobs.Jobs(9, "cuda_ad_rgb").slots] == ["GPU-a", "GPU-b", "GPU-c"]
-    monkeypatch.setenv(jobs.GPUS, "3, 1")
+    monkeypatch.setenv(jobs.GPUS, "3, , 1,")
     assert [slot.gpu for slot in jobs.Jobs(9, "cuda_ad_rgb").slots] == ["3", "1"]
     assert [slot.gpu for slot in jobs.Jobs(2, "llvm_ad_rgb").slots] == ["", ""]
     assert [slot.gpu for slot in jobs.Jobs(1, "cuda_ad_rgb").slots] == [""]

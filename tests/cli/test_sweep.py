@@ -129,8 +129,8 @@ def test_one_target_for_all_integrators(folder, varied):
 def test_names_are_short_safe_and_different(folder):
     keys = ["run.spp", "target.render.spp", "parameters[0].bounds"]
     assert short_keys(keys) == dict(zip(keys, ["run.spp", "render.spp", "bounds"], strict=True))
-    assert [in_words(each) for each in (0.1, 1e-05, True, None, "a, b", [1, 2.5], {"type": "sgd"})] == [
-        "0.1", "1e-05", "true", "null", "'a, b'", "[1, 2.5]", "{type: sgd}",
+    assert [in_words(each) for each in (0.1, 0.1234567, 1e-05, True, None, "a, b", [1, 2.5], {"type": "sgd"})] == [
+        "0.1", "0.1234567", "1e-05", "true", "null", "'a, b'", "[1, 2.5]", "{type: sgd}",
     ]  # fmt: skip
     nested = {"kind": [1, 2.5], "type": "b", "c": {"d": True}}
     assert plans.named({"optimizer": nested}, []).name == "optimizer=b-kind=1-2.5-c=d=true"
@@ -367,6 +367,7 @@ def test_a_fault_outside_the_run_ends_the_sweep(folder, monkeypatch, code):
     )
     result = reslrb("sweep", "tiny.yaml", "--vary", RATES, "-o", "s")
     assert pages == [True]  # before the first run begins
+    assert "run 1 of 2: learning_rate=0.02, seed 0\n" in result.output
     assert result.exit_code == code
     assert "--resume s" in result.output or code == 3
     assert read_sweep(Path("s")).failures == {}
@@ -670,6 +671,9 @@ def test_names_of_a_stored_sweep(tmp_path: Path, names: list[str], version: int,
     sweep.write(tmp_path)
     if message is None:
         assert read_sweep(tmp_path) == sweep
+        name = run_name(combinations[0], 1)
+        assert plans.is_left(tmp_path, sweep, name)
+        assert not plans.is_left(tmp_path, replace(sweep, failures={name: plans_file.Failure(1, "")}), name)
     else:
         with pytest.raises(ConfigError, match=rf"sweep\.json: {message}"):
             read_sweep(tmp_path)
