@@ -40,10 +40,10 @@ LOWER, MORE_SAMPLES = 3, 16
 LONGER = "more iterations"
 
 #: The proposal to render the target with more samples.
-CLEANER = "a cleaner target"
+CLEANER, UNBIASED = "a cleaner target", "a loss without bias"
 
 #: Proposals in the order of priority: the first ones make the later ones useless.
-ORDER = ("a limit", "a lower rate", "a higher rate", "a new run from here", LONGER, CLEANER)
+ORDER = ("a limit", "a lower rate", "a higher rate", "a new run from here", LONGER, UNBIASED, CLEANER)
 
 #: Maximum number of parameters named for one verdict.
 MOST_NAMED = 3
@@ -153,7 +153,7 @@ def verdict_words(results: Mapping[str, Any], key: str) -> str:
     if verdict == UNDETERMINED and about.get("partner"):
         words += f": {shorten(about['partner'], PARTNER_WIDTH)} makes up for it"
     if verdict == NOISE and _is_of_target(about):
-        words += " of the target"
+        words += _source(results)
     share = shares.get(verdict)
     words = words if share is None or share == 1 else f"{words} ({100 * share:.3g} %)"
     unseen = shares.get(UNSEEN) if verdict != UNSEEN else None
@@ -173,6 +173,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
     about, measured = _about(results, key), results.get("certainty") or {}
     if about.get("verdict") == LOST:
         return Remedy("a limit", "its own bounds: [LOW, HIGH]")
+    if about.get("verdict") == NOISE and measured.get("is_biased") and _is_of_target(about):
+        return Remedy(UNBIASED, "--set loss.type=l2")
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return _samples(MORE_SAMPLES * measured["target_spp"])
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
@@ -215,9 +217,8 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
         keys = [key for key in verdicts if verdicts[key] == verdict]
         named = ", ".join(shorten(key, KEY_WIDTH) for key in keys[:MOST_NAMED])
         rest = f" and {count(len(keys) - MOST_NAMED, 'more parameter')}" if len(keys) > MOST_NAMED else ""
-        of_target = (
-            " of the target" if any(verdict == NOISE and _is_of_target(_about(results, key)) for key in keys) else ""
-        )
+        hidden = any(verdict == NOISE and _is_of_target(_about(results, key)) for key in keys)
+        of_target = _source(results) if hidden else ""
         line = f"{'not converged, ' if verdict == MOVING else ''}{verdict}{of_target}: {named}{rest}"
         shares = [record.percent() for record in incomplete_records(results.get("incomplete") or ())
                   if record.parameter in keys and verdict == INCOMPLETE]  # fmt: skip
@@ -237,8 +238,15 @@ def noise_line(results: Mapping[str, Any]) -> str:
     return f"spread: by the noise of the run; noise and errors of targets{which} are not in it"
 
 
+def _source(results: Mapping[str, Any]) -> str:
+    """Return the source of the noise that hides values if `_is_of_target` is true."""
+    return " of the images" if (results.get("certainty") or {}).get("is_biased") else " of the target"
+
+
 def _is_of_target(about: Mapping[str, Any]) -> bool:
-    """True if the target's noise makes up more than `OF_TARGET` of any entry's spread."""
+    """True if the target's noise, or a bias by noise of the images, makes up more than `OF_TARGET` of any entry's
+    spread.
+    """
     pairs = zip(about.get("of_target") or (), about.get("spread") or (), strict=False)
     return any(part is not None and whole and part > OF_TARGET * whole for part, whole in pairs)
 

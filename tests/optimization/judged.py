@@ -7,8 +7,10 @@ lamp that lights nothing.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from kit import POSTER_BSDF, area, diffuse, ref, scene, sensor, shape
@@ -87,13 +89,15 @@ def write_scene(folder: Path) -> None:
     (folder / "toy.yaml").write_text(CONFIG)
 
 
-def run(folder: Path, toy: Toy, seed: int = 0) -> Outcome:
-    """Run the recovery in `folder`, which holds the scene, and return the measured certainty."""
+def run(folder: Path, toy: Toy, seed: int = 0, truth: Mapping[str, Any] | None = None) -> Outcome:
+    """Run the recovery in `folder`, which holds the scene, and return the measured certainty. `truth` has the true
+    values of a run whose target is a file.
+    """
     entries = {key: "" if options.startswith("motion:") else f"key: {key}, " for key, options in toy.parameters.items()}
     parameters = ", ".join(f"{{{named}{toy.parameters[key]}}}" for key, named in entries.items())
     settings = [f"parameters=[{parameters}]", f"run.seed={seed}", *toy.settings]
     problem = assemble(load(folder / "toy.yaml", settings))
-    true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
+    true = {key: np.asarray(value, dtype=np.float64) for key, value in (truth or problem.truth).items()}
     problem.truth.clear()  # no verdict uses the truth
     certainty = Certainty(problem)
     state = standing(problem)

@@ -208,6 +208,11 @@ def test_noise_of_the_target_is_told_from_noise_of_the_run():
     assert warnings(found) == [
         "below the noise of the target: lamp.radiance.value (a cleaner target: --set target.render.spp=1024)"
     ]
+    found["certainty"]["is_biased"] = True  # of a loss like `l1`, whatever the target is
+    assert parameter_lines(found, 120)[1].endswith("below the noise of the images: a loss without bias")
+    assert warnings(found) == [
+        "below the noise of the images: lamp.radiance.value (a loss without bias: --set loss.type=l2)"
+    ]
     found = judged(noisy | {"of_target": [1.0]})
     assert parameter_lines(found, 120)[1].endswith("below the noise")
     assert len(parameter_lines(found, 120)) == 2

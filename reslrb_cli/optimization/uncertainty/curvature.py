@@ -30,6 +30,10 @@ b.
 
     B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
 
+Noise of a step's images adds the same b to all gradients too, if dL/dI is not a linear function of the image. `l1` and
+`ssim` are examples. `_image_biases` estimates the mean effect on dL/dI with two sets of images. B contains the square
+of the mean pull along each direction, and for single entries the product of both pulls, whose noise has no bias.
+
 In the estimate by entry, the diagonal of B is probed and averaged like the diagonal of H. A standard error is then
 added. For few entries, the average may be almost zero by chance. Underestimated target noise would also make results
 look too certain.
@@ -67,6 +71,8 @@ MARGIN = 1.0
 MOST_VALUES = 2**18
 #: Images for the target's noise, with the target's samples if these are at most a multiple of a step's.
 REPLICAS, AGAIN = 4, 4
+#: Deviation of dL/dI from a linear function of the image, as a share of dL/dI, that counts as rounding.
+LINEAR = 1e-3
 #: Maximum factor by which they are made brighter or darker.
 MOST_ASTRAY = 10.0
 #: Samples for probes of large parameters, and the number of the first sample for products.
@@ -259,7 +265,8 @@ class LossCurvature:
     def __init__(self, problem: Problem, spp: int, of_target: bool = True, round: int = 0) -> None:
         self.problem, self.spp, self.round = problem, spp, round
         self._base = self._images()
-        self._weights = [self._weight(place, view) for place, view in enumerate(problem.trained)]
+        pairs = zip(problem.trained, *self._base, strict=True)
+        self._weights = [self._weight(view, 0.5 * (a + b)) for view, a, b in pairs]
         values = sum(weight.size for weight in self._weights)
         random = np.random.default_rng(self._seed(0, 0))
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
@@ -271,6 +278,9 @@ class LossCurvature:
         self._drawn = 0
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
+        #: Two samples of the mean effect that the noise of a step's images has on dL/dI (H, W, C), by view; empty if
+        #: there is none.
+        self.biases = self._image_biases() if of_target and not self._is_linear() else []
 
     def along(
         self, changes: Sequence[ParameterChange], go_on: Callable[[], bool]
@@ -282,6 +292,7 @@ class LossCurvature:
         columns: list[list[Array]] = [[], []]
         odd: list[list[Array]] = [[], []]
         even: list[float] = []
+        bias: list[float] = []
         for change in changes:
             if not go_on():
                 break
@@ -289,9 +300,13 @@ class LossCurvature:
             for direction in change.directions:
                 directions.append(direction)
                 even.append(0.0)
+                bias.append(0.0)
                 for half in (0, 1):
                     slopes = [_of_channel(each, direction.channel) for each in derivatives[half]]
                     columns[half].append(self._in_a_row(slopes))
+                    if self.biases:
+                        views = zip(slopes, self.biases[half], strict=True)
+                        bias[-1] += 0.5 * sum(float(np.sum(each * effect)) for each, effect in views)
                     pulls = [(n, each) for views in self.noises for n, each in zip(views, slopes, strict=True)]
                     if pulls:
                         odd[half].append(np.concatenate([noise.in_blocks(each) for noise, each in pulls]))
@@ -305,10 +320,11 @@ class LossCurvature:
         self.sure = _sure_share(a * b)
         sure = np.sqrt(np.outer(self.sure, self.sure))
         H = _symmetric(a @ b.T * sure) + self._of_regularizers(directions)
-        if not self.noises:
-            return directions, H, np.zeros_like(H)
-        a, b = (np.array(rows) for rows in odd)
-        return directions, H, _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
+        B = np.outer(bias, bias)
+        if self.noises:
+            a, b = (np.array(rows) for rows in odd)
+            B += _symmetric(a @ b.T / len(self.noises)) + np.outer(even, even)
+        return directions, H, B
 
     def products(self, change: ParameterChange) -> list[dict[str, tuple[Array, Array]]]:
         """Return the products of H and the directions of a change: two independent samples of all entries for each
@@ -387,9 +403,12 @@ class LossCurvature:
 
     def _by_entry_of_target(self, first: int, go_on: Callable[[], bool]) -> dict[str, Array]:
         """Return the diagonal of B for each parameter as a flat array. The probes are numbered from `first` on. It is
-        empty without a rendered target.
+        empty without a rendered target, if noise of the images has no bias.
         """
         total: dict[str, Array] = {}
+        if self.biases:
+            pair = [self._probe(bias, 2 * (first + PROBED + 1) + half) for half, bias in enumerate(self.biases)]
+            total = {key: pair[0][key].astype(np.float64) * pair[1][key] for key in pair[0]}
         views = self.noises[:PROBED]
         random = np.random.default_rng(self._seed(1, first))
         for number, noises in enumerate(views):
@@ -399,7 +418,7 @@ class LossCurvature:
                 [noise.signed(random) for noise in noises], 2 * (first + number)
             ).items():
                 total[key] = total.get(key, 0.0) + a * b / len(views)
-        if total:
+        if views:
             for key, (a, b) in self._two_probes([noise.even for noise in views[0]], 2 * (first + PROBED)).items():
                 total[key] = total[key] + a * b
         return total
@@ -461,6 +480,38 @@ class LossCurvature:
         side = max(mixed, round(np.ceil(np.sqrt(true.shape[0] * true.shape[1] / MOST_VALUES))))
         return [TargetNoise(each, even, side) for each in odd]
 
+    def _is_linear(self) -> bool:
+        """True if dL/dI is a linear function of the image, as that of `l2` is. Noise of the image then has no bias."""
+        for place, view in enumerate(self.problem.trained):
+            a, b = (fill_gaps(np.array([half[place]]))[0] for half in self._base)
+            true = np.array(view.target, dtype=np.float64)
+            apart = 0.5 * (self._slope(view, true, a) + self._slope(view, true, b))
+            if rms(apart - self._slope(view, true, 0.5 * (a + b))) > LINEAR * rms(apart):
+                return False
+        return True
+
+    def _image_biases(self) -> list[list[Array]]:
+        """Return two samples of the mean effect of the images' noise on dL/dI, by view.
+
+        The mean of several images takes the role of the image without noise. Its own noise leaves at most half of the
+        effect, which is the share for a kink, as that of `l1`. The difference is therefore doubled. A kink is sharper
+        without noise, so its curvature is larger than W. The effect is multiplied by the ratio of both, because offsets
+        are divided by W.
+        """
+        problem, found = self.problem, []
+        for half in (0, 1):
+            numbers = range(FIRST_PRODUCT + REPLICAS * half, FIRST_PRODUCT + REPLICAS * (half + 1))
+            images = [see_images(problem, problem.config.run.spp, -number, _PURPOSE) for number in numbers]
+            biases: list[Array] = []
+            for view, samples in zip(problem.trained, zip(*images, strict=True), strict=True):
+                true, known = np.array(view.target, dtype=np.float64), fill_gaps(np.array(samples))
+                mean = known.mean(axis=0)
+                bias = np.mean([self._slope(view, true, image) for image in known], axis=0)
+                softer = self._weights[len(biases)].sum() / max(float(self._weight(view, mean).sum()), 1e-300)
+                biases.append(2 * min(softer, 1.0) * (bias - self._slope(view, true, mean)))
+            found.append(biases)
+        return found
+
     def _slope(self, view: View, target: Array, image: Array) -> Array:
         """Return dL/dI of an exposed `image` for another `target`, both (H, W, C)."""
         return finite(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
@@ -486,14 +537,13 @@ class LossCurvature:
             )  # fmt: skip
         return take_gradient(problem)
 
-    def _weight(self, place: int, view: View) -> Array:
-        """Return d2L/dI2 for the pixels (H, W, C) of a view's exposed image. The second derivative is computed from
+    def _weight(self, view: View, image: Array) -> Array:
+        """Return d2L/dI2 for the pixels (H, W, C) of a view's exposed `image`. The second derivative is computed from
         differences of dL/dI.
 
         The differences of dL/dI use steps as large as the residual between image and target. If L has a kink (`l1`),
         the result is L's curvature at the scale of the noise.
         """
-        image = 0.5 * (self._base[0][place] + self._base[1][place])
         true = view.kept(np.array(view.target, dtype=np.float64))
         known = np.isfinite(image)
         image = np.where(known, image, true)

@@ -159,6 +159,7 @@ class Certainty:
                 learning_rate=config.optimizer.learning_rate,
                 target_noise=self._target_noise(),
                 target_spp=None if render is None else render.spp,
+                is_biased=bool(curvature.biases),
             )
         finally:
             take_gradient(problem)

@@ -167,7 +167,8 @@ class CertaintyRecord(Jsonable):
     `measure_s` is the measuring time in seconds without compilation. `share` is `measure_s` divided by the time of the
     run's iterations. `iterations`, `learning_rate` and `target_spp` repeat the run's settings.
     `learning_rate` is that of `optimizer`. `target_noise` is `measured` if all targets were rendered, `in part` if some
-    were, otherwise `left out`. The spreads include only the noise of rendered targets.
+    were, otherwise `left out`. The spreads include only the noise of rendered targets. `is_biased` is true if noise of
+    the images biases the gradients of the loss. The spreads, and the parts `of_target`, then include the bias.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -177,6 +178,7 @@ class CertaintyRecord(Jsonable):
     learning_rate: float
     target_noise: str
     target_spp: int | None = None
+    is_biased: bool = False
 
     def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
         """Return the record with the verdict `derivative incomplete` for the parameters `keys`."""
