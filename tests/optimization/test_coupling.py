@@ -11,14 +11,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from kit import area, scene, sensor, shape
-from optimization.judged import CONFIG
+from optimization.judged import CONFIG, Toy, run
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.uncertainty import coupling, measuring
 from reslrb_cli.optimization.uncertainty.coupling import (
     MOST_NOISE,
     Maps,
+    _cells,
     followed,
     make_maps,
     measure_maps,
@@ -221,7 +223,7 @@ def write_sample(folder, side: int, size: int) -> None:
     ))  # fmt: skip
 
 
-def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path):
+def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path, monkeypatch):
     """The reference changes one texel at a time. A texel's curvature contains that of every second texel."""
     write_sample(tmp_path, 3, 16)
     keys = list(MAPS)[1:]
@@ -248,3 +250,78 @@ def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path):
     scale = np.sqrt(np.einsum("ikk->k", expected) / 9)
     error = (maps.matrix - expected) / np.outer(scale, scale)
     assert rms(error) < 2.5 * maps.noise, error
+    assert np.abs(expected / np.outer(scale, scale))[:, 0, 1].max() > 0.3
+    assert measure_maps(curvature, 0.05, 512, lambda: False) == ([], set(keys))
+    # Noise that is too large is measured again, up to a limit of the samples.
+    spps = []
+    monkeypatch.setattr(coupling, "MOST_NOISE", 0.0)
+    monkeypatch.setattr(coupling, "LossCurvature", lambda problem, spp, **options: (
+        spps.append(spp), LossCurvature(problem, spp, **options))[1])  # fmt: skip
+    assert len(measure_maps(LossCurvature(problem, 2), 0.05, 40, lambda: True)[0]) == 1
+    assert spps == [8, 32]
+    alone = assembled(tmp_path, keys[:1])
+    assert measure_maps(LossCurvature(alone, 4), 0.05, 4, lambda: True) == ([], set())
+
+
+def places_of(**sizes: tuple[int, ...]) -> dict[str, tuple[np.ndarray, ...]]:
+    """Return the cells of parameters with arrays of these sizes. `__` stands for a dot in a key."""
+    arrays = {key.replace("__", "."): np.ones(size, np.float32) for key, size in sizes.items()}
+    values = {key: mi.TensorXf(array) for key, array in arrays.items()}
+    problem = SimpleNamespace(selection=SimpleNamespace(array=lambda key: arrays[key]), optimizer=values)
+    return _cells(problem, list(arrays))
+
+
+def test_cells_are_texels_of_the_coarsest_map_or_vertices(llvm):
+    found = places_of(a=(2, 3, 3), b=(4, 6, 1))
+    channels, cells, halves = found["a"]
+    np.testing.assert_array_equal(channels, np.tile([0, 1, 2], 6))
+    np.testing.assert_array_equal(cells, np.repeat(np.arange(6), 3))
+    np.testing.assert_array_equal(halves[::3], [0, 1, 0, 1, 0, 1])
+    fine, same, _ = found["b"]
+    assert not fine.any()
+    np.testing.assert_array_equal(np.bincount(same), [4] * 6)
+    np.testing.assert_array_equal(same.reshape(4, 6)[:2, 4:], 2)
+    for key, (_, at, half) in found.items():
+        assert set(zip(at, half, strict=True)) == set(enumerate([0, 1, 0, 1, 0, 1])), key
+    found = places_of(m__vertex_color=(15,), m__vertex_rough=(5,), m__vertex_odd=(7,), m__vertices=(5,))
+    assert set(found) == {"m.vertex_color", "m.vertex_rough"}
+    channels, cells, halves = found["m.vertex_color"]
+    np.testing.assert_array_equal(channels, np.tile([0, 1, 2], 5))
+    np.testing.assert_array_equal(cells, np.repeat(np.arange(5), 3))
+    np.testing.assert_array_equal(halves[::3], found["m.vertex_rough"][2])
+    assert len(places_of(a=(2, 3, 3))) < 2
+    assert len(places_of(a=(2, 3, 3), m__vertex_color=(15,))) < 2
+
+
+def test_runs_measure_maps(llvm, tmp_path, monkeypatch):
+    write_sample(tmp_path, 3, 8)
+    given = []
+    monkeypatch.setattr(measuring, "weigh", lambda *parts: (given.append(parts), weigh(*parts))[1])
+    sets = ("optimizer={type: auto}", "run.iterations=20", "run.spp=4", "target.render.spp=64")
+    toy = Toy("maps", dict.fromkeys(MAPS, "initial: 0.5, bounds: [0.05, 1]"), {}, sets)
+    run(tmp_path, toy)
+    ((_, directions, H, _, _, alone, (maps,)),) = given
+    assert [key for key, _ in maps.names] == [*[next(iter(MAPS))] * 2, *MAPS]
+    assert maps.matrix.shape == (9, 5, 5)
+    np.testing.assert_array_equal(alone, np.diag(H))
+    assert len(directions) == len(H)
+    # Maps that were not measured are not settled, and have no spread.
+    monkeypatch.setattr(measuring, "measure_maps", lambda *parts: ([], set(MAPS)))
+    for about in run(tmp_path, toy).certainty.parameters.values():
+        assert (about.verdict, about.spread) == ("below the noise", None)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+def test_maps_of_one_surface_make_up_for_each_other(seed, llvm, tmp_path):
+    """One image does not determine the colour, the roughness and the metallic weight of each texel."""
+    write_sample(tmp_path, 8, 64)
+    toy = Toy("maps", dict.fromkeys(MAPS, "initial: 0.5, bounds: [0.05, 1]"), {},
+              ("optimizer={type: auto}", "run.iterations=300", "run.spp=32", "target.render.spp=1024"))  # fmt: skip
+    found = run(tmp_path, toy, seed)
+    for key, about in found.certainty.parameters.items():
+        error = rms(found.errors[key])
+        assert error < 2 * about.spread[0], (key, about, error)
+        assert about.verdict in ("not determined", "below the noise"), (key, about, error)
+        assert about.verdict == "below the noise" or about.partner in set(MAPS) - {key}
+    assert "not determined" in {about.verdict for about in found.certainty.parameters.values()}

@@ -52,7 +52,7 @@ MOST_LAST, MOST_RECORDED = 200, 2**22
 MOST_ROWS = 2**10
 #: Curvature that takes longer than this share of the run's iterations, this many of them, and this many seconds is left
 #: out.
-SHARE, MOST_STEPS, LEAST_SECONDS = 0.25, 50, 5.0
+SHARE, MOST_STEPS, LEAST_SECONDS = 0.25, 50, 20.0
 
 
 class Certainty:
