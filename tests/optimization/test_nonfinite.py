@@ -137,7 +137,7 @@ PLACES = {
     "auto": {
         "iterate step gradient", "step measure_curvature gradient", "__init__ _images see_images",
         "_derivatives _images see_images", "measure sample_gradient", "_target_noises _noises render_in_passes",
-        "by_entry _two_probes _probe", "_by_entry_of_target _two_probes _probe", "followed products _probe",
+        "by_entry _two_probes _probe", "_by_entry_of_target _two_probes _probe", "products _two_probes _probe",
     },
     "auto, moving": {"step update exposed_images"},
     "sgd": {

@@ -53,21 +53,17 @@ from reslrb_cli.statistics import Array, rms
 #: Noise of M, as a share of its mean diagonal, at which measurements end. It hides smaller eigenvalues.
 MOST_NOISE = 0.1
 
-Free = Mapping[str, Array]
-
-
-def free_entries(measured: Mapping[str, Measured]) -> dict[str, Array]:
-    """Return the entries (N,) of each large parameter that may move: with a gradient, and not at a bound."""
-    return {key: own.touched & ~own.at_bound for key, own in measured.items() if not own.is_small}
-
 
 def followed(
-    curvature: LossCurvature, changes: Sequence[ParameterChange], free: Free, go_on: Callable[[], bool]
+    curvature: LossCurvature,
+    changes: Sequence[ParameterChange],
+    free: Mapping[str, Array],
+    go_on: Callable[[], bool],
 ) -> list[ParameterChange]:
     """Return the changes of small parameters, together with those of the textures that compensate for them best. The
     list is shorter if `go_on` returns false.
 
-    Textures without a change in `changes` stay.
+    `free` has the entries (N,) of each large parameter that may move. Textures without a change in `changes` stay.
     """
     problem, stiff = curvature.problem, dict[str, Array]()
     for change in changes:
@@ -120,7 +116,7 @@ def _with_textures(
     change: ParameterChange,
     product: Mapping[str, tuple[Array, Array]],
     stiff: Mapping[str, Array],
-    free: Free,
+    free: Mapping[str, Array],
 ) -> list[ParameterChange]:
     """Add the changes of textures to a change of a small parameter. Return no change if no texture moves."""
     values, shares, (direction,) = dict(change.values), dict[str, float](), change.directions

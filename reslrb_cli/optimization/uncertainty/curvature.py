@@ -282,6 +282,12 @@ class LossCurvature:
         #: there is none.
         self.biases = self._image_biases() if of_target and not self._is_linear() else []
 
+    def repeated(self, round: int) -> LossCurvature:
+        """Return a measurement with other samples. The noise of targets and the biases are not measured again."""
+        other = LossCurvature(self.problem, self.spp, of_target=False, round=round)
+        other.noises, other.biases = self.noises, self.biases
+        return other
+
     def along(
         self, changes: Sequence[ParameterChange], go_on: Callable[[], bool]
     ) -> tuple[list[ParameterDirection], Array, Array]:
@@ -332,13 +338,15 @@ class LossCurvature:
         """
         derivatives, found = self._derivatives(change), []
         for direction in change.directions:
-            pair = []
-            for half in (0, 1):
-                self._drawn += 1
-                images = zip(self._weights, derivatives[half], strict=True)
-                gradients = [weight * _of_channel(image, direction.channel) for weight, image in images]
-                pair.append(self._probe(gradients, FIRST_PRODUCT + self._drawn))
-            found.append({key: (pair[0][key].astype(np.float64), pair[1][key].astype(np.float64)) for key in pair[0]})
+            first, second = (
+                [
+                    weight * _of_channel(each, direction.channel)
+                    for weight, each in zip(self._weights, views, strict=True)
+                ]
+                for views in derivatives
+            )
+            found.append(self._two_probes(first, second, FIRST_PRODUCT + self._drawn + 1))
+            self._drawn += 2
         return found
 
     def _images(self) -> list[list[Array]]:
@@ -384,7 +392,7 @@ class LossCurvature:
             if not go_on():
                 break
             roots = [np.sqrt(weight) * random.choice([-1.0, 1.0], size=weight.shape) for weight in self._weights]
-            found.append(self._two_probes(roots, 2 * probe))
+            found.append(self._two_probes(roots, roots, 2 * probe))
             for key, (a, _) in found[-1].items():
                 signs = random.choice([-1.0, 1.0], size=a.shape)
                 bent[key] = bent.get(key, 0.0) + signs * self.problem.stiffness(key, signs)
@@ -407,25 +415,29 @@ class LossCurvature:
         """
         total: dict[str, Array] = {}
         if self.biases:
-            pair = [self._probe(bias, 2 * (first + PROBED + 1) + half) for half, bias in enumerate(self.biases)]
-            total = {key: pair[0][key].astype(np.float64) * pair[1][key] for key in pair[0]}
+            pairs = self._two_probes(self.biases[0], self.biases[1], 2 * (first + PROBED + 1))
+            total = {key: a * b for key, (a, b) in pairs.items()}
         views = self.noises[:PROBED]
         random = np.random.default_rng(self._seed(1, first))
         for number, noises in enumerate(views):
             if not go_on():
                 return {}
-            for key, (a, b) in self._two_probes(
-                [noise.signed(random) for noise in noises], 2 * (first + number)
-            ).items():
+            signed = [noise.signed(random) for noise in noises]
+            for key, (a, b) in self._two_probes(signed, signed, 2 * (first + number)).items():
                 total[key] = total.get(key, 0.0) + a * b / len(views)
         if views:
-            for key, (a, b) in self._two_probes([noise.even for noise in views[0]], 2 * (first + PROBED)).items():
+            even = [noise.even for noise in views[0]]
+            for key, (a, b) in self._two_probes(even, even, 2 * (first + PROBED)).items():
                 total[key] = total[key] + a * b
         return total
 
-    def _two_probes(self, gradients: Sequence[Array], number: int) -> dict[str, tuple[Array, Array]]:
-        """Return two gradients of each parameter from separate sample sets. `gradients` has dL/dI for each view."""
-        a, b = (self._probe(gradients, number + half) for half in (0, 1))
+    def _two_probes(
+        self, first: Sequence[Array], second: Sequence[Array], number: int
+    ) -> dict[str, tuple[Array, Array]]:
+        """Return two gradients of each parameter from separate sample sets. `first` and `second` have the dL/dI of each
+        gradient for each view.
+        """
+        a, b = (self._probe(gradients, number + half) for half, gradients in enumerate((first, second)))
         return {key: (a[key].astype(np.float64), b[key].astype(np.float64)) for key in a}
 
     def _target_noises(self) -> list[list[TargetNoise]]:

@@ -14,7 +14,7 @@ from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.uncertainty.coupling import followed, free_entries, measure_maps, with_followed
+from reslrb_cli.optimization.uncertainty.coupling import followed, measure_maps, with_followed
 from reslrb_cli.optimization.uncertainty.curvature import (
     LossCurvature,
     ParameterDirection,
@@ -121,10 +121,11 @@ class Certainty:
                 curvature = latest = LossCurvature(problem, spp)
                 measured = self._measured(gradients, iterations)
                 found = curvature.along(plan, go_on)
+                free = {key: own.is_free for key, own in measured.items() if not own.is_small}
                 maps, unknown = measure_maps(curvature, STEP, MOST_MULTIPLE * config.run.spp, go_on)
-                count, extra = len(found[0]), followed(curvature, plan, free_entries(measured), go_on)
+                count, extra = len(found[0]), followed(curvature, plan, free, go_on)
                 if extra:
-                    again = LossCurvature(problem, spp, round=1)
+                    again = curvature.repeated(1)
                     together = again.along([*plan, *extra], go_on)
                     if len(together[0]) >= count:
                         latest, found = again, together

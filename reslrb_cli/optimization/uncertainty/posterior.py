@@ -130,6 +130,11 @@ class Measured:
         return np.asarray(lower | upper)
 
     @property
+    def is_free(self) -> Array:
+        """Entries (N,) that may move: with a gradient, and not at a bound."""
+        return np.asarray(self.touched & ~self.at_bound)
+
+    @property
     def moved(self) -> Array:
         """Entries (N,) that the run has moved. They had gradients on the way, but may have none at their final
         values.

@@ -411,8 +411,8 @@ class Group:
 
 
 def _free(own: Measured) -> Array:
-    """Return the entries (N,) that are visible, have a gradient, and are not at a bound."""
-    return np.asarray(own.touched & (True if own.seen is None else own.seen) & ~own.at_bound)
+    """Return the visible entries (N,) that may move."""
+    return own.is_free if own.seen is None else own.is_free & own.seen
 
 
 def _groups(own: Measured, by_entry: EntryCurvature) -> list[Group]:
