@@ -333,19 +333,15 @@ class LossCurvature:
         return directions, H, B
 
     def products(self, change: ParameterChange) -> list[dict[str, tuple[Array, Array]]]:
-        """Return the products of H and the directions of a change: two independent samples of all entries for each
-        parameter.
-        """
-        derivatives, found = self._derivatives(change), []
+        """Return two independent samples of the product of H and each direction of a change, by parameter."""
+        found = []
+        weighted = [
+            [weight * image for weight, image in zip(self._weights, views, strict=True)]
+            for views in self._derivatives(change)
+        ]
         for direction in change.directions:
-            first, second = (
-                [
-                    weight * _of_channel(each, direction.channel)
-                    for weight, each in zip(self._weights, views, strict=True)
-                ]
-                for views in derivatives
-            )
-            found.append(self._two_probes(first, second, FIRST_PRODUCT + self._drawn + 1))
+            one, other = ([_of_channel(image, direction.channel) for image in views] for views in weighted)
+            found.append(self._two_probes(one, other, FIRST_PRODUCT + self._drawn + 1))
             self._drawn += 2
         return found
 
@@ -431,13 +427,9 @@ class LossCurvature:
                 total[key] = total[key] + a * b
         return total
 
-    def _two_probes(
-        self, first: Sequence[Array], second: Sequence[Array], number: int
-    ) -> dict[str, tuple[Array, Array]]:
-        """Return two gradients of each parameter from separate sample sets. `first` and `second` have the dL/dI of each
-        gradient for each view.
-        """
-        a, b = (self._probe(gradients, number + half) for half, gradients in enumerate((first, second)))
+    def _two_probes(self, one: Sequence[Array], other: Sequence[Array], number: int) -> dict[str, tuple[Array, Array]]:
+        """Return two gradients of each parameter from separate samples, for two lists of dL/dI by view."""
+        a, b = (self._probe(gradients, number + half) for half, gradients in enumerate((one, other)))
         return {key: (a[key].astype(np.float64), b[key].astype(np.float64)) for key in a}
 
     def _target_noises(self) -> list[list[TargetNoise]]:
@@ -494,8 +486,8 @@ class LossCurvature:
 
     def _is_linear(self) -> bool:
         """True if dL/dI is a linear function of the image, as that of `l2` is. Noise of the image then has no bias."""
-        for place, view in enumerate(self.problem.trained):
-            a, b = (fill_gaps(np.array([half[place]]))[0] for half in self._base)
+        for view, *halves in zip(self.problem.trained, *self._base, strict=True):
+            a, b = (fill_gaps(np.array([half]))[0] for half in halves)
             true = np.array(view.target, dtype=np.float64)
             apart = 0.5 * (self._slope(view, true, a) + self._slope(view, true, b))
             if rms(apart - self._slope(view, true, 0.5 * (a + b))) > LINEAR * rms(apart):
