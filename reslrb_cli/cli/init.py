@@ -255,18 +255,20 @@ def choose_size(film: Size, photo: StoredImage | None, fixed: bool = False) -> S
     aspect ratio. Without a photograph, the film keeps its own aspect ratio.
 
     A `fixed` film, which is a crop of a larger one, keeps its size. Raises ConfigError if the ratios of the photograph
-    and the film differ.
+    and the film differ by more than `_RATIO`, and a crop would bring them closer.
     """
     width, height = film if photo is None else photo.size
     if photo is not None and abs(width / height * film[1] / film[0] - 1) > _RATIO:
-        fits = (width, round(width * film[1] / film[0]))
-        fits = fits if fits[1] <= height else (round(height * film[0] / film[1]), height)
-        raise ConfigError(
-            photo.path,
-            "",
-            f"is {width}x{height} pixels, the scene's film {film[0]}x{film[1]}, with another aspect ratio; crop it to "
-            f"the film's view, such as {fits[0]}x{fits[1]}, or give the film the photograph's ratio",
-        )
+        lower = width, max(round(width * film[1] / film[0]), 1)
+        narrower = max(round(height * film[0] / film[1]), 1), height
+        fits = lower if lower[1] <= height else narrower
+        if photo.size not in (lower, narrower):
+            raise ConfigError(
+                photo.path,
+                "",
+                f"is {width}x{height} pixels, the scene's film {film[0]}x{film[1]}, with another aspect ratio; crop it "
+                f"to the film's view, such as {fits[0]}x{fits[1]}, or give the film the photograph's ratio",
+            )
     if fixed:
         return film
     scale = min(1.0, (PIXELS / (width * height)) ** 0.5)

@@ -204,7 +204,7 @@ def _opened(path: Path) -> Iterator[_Header]:
             file.seek(0)
             header = reader(path, file)
             if min(header.size) < 1:
-                raise ValueError("has no pixels")
+                raise ConfigError(path, "", f"is {header.size[0]}x{header.size[1]} pixels, so it is empty")
             yield header
         except Exception as error:
             if is_out_of_memory(error) or isinstance(error, ConfigError):
@@ -244,7 +244,7 @@ def _by_pillow(path: Path, file: BinaryIO, image: ImageFile) -> StoredImage:
     if image.format != "BMP":
         file.seek(0)
         if not _ends(file.read()):  # Pillow fills missing data with grey
-            raise ValueError("has no end")
+            raise ConfigError(path, "", "is truncated: the image has no end")
     mode = {"1": "L", "P": "RGB"}.get(image.mode, image.mode)
     return StoredImage(path, _as_pixels(np.array(image.convert(mode))), tuple(_NAMES[mode]), 255)
 
@@ -320,36 +320,47 @@ def _hdr(path: Path, file: BinaryIO) -> _Header:
 
 
 _SPACE = rb"(?:\s|#[^\n]*\n)+"
-_NETPBM = re.compile(rb"P([2356fF])" + 3 * (_SPACE + rb"([^\s#]+)") + rb"\s")
+_FLOAT = rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NETPBM = re.compile(rb"P([2356fF])(?:" + 2 * (_SPACE + rb"(\d+)") + _SPACE + rb"(" + _FLOAT + rb")\s)?")
 
 
 def _netpbm(path: Path, file: BinaryIO) -> _Header:
     """Read PGM, PPM and PFM files. PGM and PPM files of more than 8 bits have the most significant byte first."""
     found = _NETPBM.match(file.read(_HEADER))
     assert found is not None
-    kind, width, height, limit = found[1], int(found[2]), int(found[3]), float(found[4])
+    kind, is_float = found[1], found[1] in b"fF"
+    if found[2] is None:
+        last = "scale" if is_float else "maximum"
+        raise ConfigError(path, "", f"has a damaged header: P{kind.decode()} must precede width, height and {last}")
+    width, height, limit = int(found[2]), int(found[3]), float(found[4])
     shape = height, width, 1 if kind in b"25f" else 3
     names = tuple("Y" if shape[2] == 1 else "RGB")
+    if limit == 0 or math.isinf(limit) if is_float else limit not in range(1, 65536):
+        right = "a scale other than 0" if is_float else "a maximum of 1 to 65535"
+        raise ConfigError(path, "", f"has {found[4].decode()} in its header in place of {right}")
+    coded = np.dtype(("<f4" if limit < 0 else ">f4") if is_float else ">u2" if limit > 255 else "u1")
 
     def decode() -> StoredImage:
         file.seek(found.end())
-        if kind in b"fF":
-            data = file.read(4 * math.prod(shape))
-            pixels = np.frombuffer(data, "<f4" if limit < 0 else ">f4").reshape(shape)[::-1] * np.float32(abs(limit))
-            return StoredImage(path, pixels.astype(np.float32), names, None)
-        if not 1 <= limit <= 65535:
-            raise ValueError("has no maximum")
-        coded, plain = (">u2", np.uint16) if limit > 255 else ("u1", np.uint8)
-        if kind in b"56":
-            data = file.read(np.dtype(coded).itemsize * math.prod(shape))
-            pixels = np.frombuffer(data, coded).astype(plain)
+        count = math.prod(shape)
+        if kind in b"23":
+            words = file.read().split()[:count]
+            if strange := [word for word in words if not word.isdigit()]:
+                raise ConfigError(path, "", f"has {one_line(strange[0].decode('latin-1'), 30)} in place of a value")
+            values = np.array(words, dtype=np.int64)
         else:
-            pixels = np.array(file.read().split()[: math.prod(shape)], dtype=np.int64)
-        if pixels.max(initial=0) > limit:
-            raise ValueError("has values above its maximum")
-        return StoredImage(path, pixels.astype(plain).reshape(shape), names, int(limit))
+            data = file.read(coded.itemsize * count)
+            values = np.frombuffer(data, coded, len(data) // coded.itemsize)
+        if values.size < count:
+            raise ConfigError(path, "", f"is truncated: it has {values.size} of {count} values")
+        if is_float:
+            pixels = values.reshape(shape)[::-1] * np.float32(abs(limit))
+            return StoredImage(path, pixels.astype(np.float32), names, None)
+        if values.max() > limit:
+            raise ConfigError(path, "", f"has the value {values.max()}, but its maximum is {limit:.0f}")
+        return StoredImage(path, values.reshape(shape).astype(coded.newbyteorder("=")), names, int(limit))
 
-    is_other = kind not in b"fF" and (kind != b"6" or limit != 255)
+    is_other = not is_float and (kind != b"6" or limit != 255)
     wrong = "is no binary PPM file with a maximum of 255, the only kind that Mitsuba's textures read; save it as PNG"
     return _Header((width, height), decode, wrong=wrong if is_other else "")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -477,6 +479,20 @@ def test_the_size_of_a_first_run(film, photo, fixed, size):
             choose_size(film, stored, fixed)
     else:
         assert choose_size(film, stored, fixed) == size
+
+
+def test_an_advised_crop_is_smaller_than_the_photograph_and_is_accepted():
+    shapes = [(81, 80), (2, 3), (3, 1), (1, 3), (1000, 7), (30, 30), (4, 10), (33, 100), (10, 1), (640, 480)]
+    for film, photo in itertools.product(shapes, shapes):
+        try:
+            choose_size(film, SimpleNamespace(size=photo, path="a.png"))
+        except ConfigError as error:
+            width, height = map(int, re.search(r"such as (\d+)x(\d+)", str(error)).groups())
+            assert 1 <= width * height < photo[0] * photo[1], (film, photo)
+            assert width <= photo[0], (film, photo)
+            assert height <= photo[1], (film, photo)
+            choose_size(film, SimpleNamespace(size=(width, height), path="a.png"))
+    assert choose_size((81, 80), SimpleNamespace(size=(30, 30), path="a.png")) == (30, 30)
 
 
 @pytest.mark.parametrize(
