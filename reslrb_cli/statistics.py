@@ -19,6 +19,15 @@ def jackknife_variance(without: Array) -> Array:
     return np.asarray((count - 1) / count * np.sum(np.square(without - without.mean(axis=0)), axis=0))
 
 
+def squares_without(rows: Array) -> tuple[float, Array]:
+    """Return the sum of the squares of rows (N, P) about their mean, and the sums (N,) without each row in turn.
+
+    Without row i, the sum is smaller by N / (N - 1) times the squared distance of row i from the mean.
+    """
+    squares = np.square(rows - rows.mean(axis=0)).sum(axis=1)
+    return float(squares.sum()), np.asarray(squares.sum() - squares * len(rows) / (len(rows) - 1))
+
+
 def special() -> Any:
     """Return `scipy.special`. Its import takes 0.2 s, and most runs need it only at their end."""
     import scipy.special

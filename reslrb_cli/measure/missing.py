@@ -1,7 +1,7 @@
 """Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
 `integrator.edges` adds silhouettes and shadow edges (`estimators/edges.py`). Some terms are still missing. Images at
-common random numbers contain all of these terms. `Missing` compares images and gradients along K segments. A segment
+common random numbers contain all of these terms. `Tracing` compares images and gradients along K segments. A segment
 k is the part a <= s <= b of the line x + s d_k through the initial values x. w_k is dL/dI at the end of the segment
 with the higher loss.
 
@@ -24,7 +24,7 @@ run's first iteration, and decides `edges: auto`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -139,8 +139,14 @@ class Tracing:
             found.append([case.image(self.images, seed, self.spp) for case in self.cases])
         return found
 
+    def samples(self, segments: Sequence[LineSegment], seeds: Sequence[int]) -> np.ndarray:
+        """Return the difference along each of K segments, and the gradient at a random point of it, for N seeds:
+        (N, K, 2).
+        """
+        return np.stack([self.sample(segment, seeds) for segment in segments], 1)
+
     def sample(self, segment: LineSegment, seeds: Sequence[int]) -> np.ndarray:
-        """Return the difference along a segment and the gradient at a random point of it, for each seed: (N, 2)."""
+        """Return the difference and the gradient of one segment, (N, 2)."""
         found = np.zeros((len(seeds), 2))
         for s, sign in ((segment.high, 1), (segment.low, -1)):
             for row, images in zip(found, self._see(segment.vector, s, seeds), strict=True):
@@ -179,35 +185,13 @@ class Tracing:
         return replace(segment, weights=[each / size for each in weights])
 
 
-@dataclass
-class Missing:
-    """Samples of one parameter's derivatives along K segments, for N seeds: N arrays (K,) of differences and of
-    gradients (`ours`).
+def missing_record(case: str, parameter: str, samples: np.ndarray) -> MissingRecord:
+    """Return the record of a parameter from the `samples` of `Tracing`, (N, K, 2). The record has no share if the
+    differences are not significantly different from 0.
     """
-
-    segments: list[LineSegment]
-    ours: list[np.ndarray] = field(default_factory=list)
-    differences: list[np.ndarray] = field(default_factory=list)
-
-    def take(self, tracing: Tracing, seeds: Sequence[int]) -> None:
-        """Add samples with these seeds."""
-        found = np.array([tracing.sample(segment, seeds) for segment in self.segments])
-        self.differences += list(found[:, :, 0].T)
-        self.ours += list(found[:, :, 1].T)
-
-    @property
-    def count(self) -> int:
-        """The number of seeds."""
-        return len(self.ours)
-
-    def record(self, case: str, parameter: str) -> MissingRecord:
-        """Return the parameter's record. It has no share if the differences are not significantly different from 0."""
-        share = None
-        if self.count > 1:
-            whole = np.stack(self.differences)
-            share = share_of(whole, whole - np.stack(self.ours))
-        value, error = share or (None, None)
-        return MissingRecord(case, parameter, value, error, len(self.segments), self.count)
+    whole, ours = np.moveaxis(samples, 2, 0)
+    share, error = (share_of(whole, whole - ours) if len(samples) > 1 else None) or (None, None)
+    return MissingRecord(case, parameter, share, error, samples.shape[1], len(samples))
 
 
 def share_of(whole: np.ndarray, missing: np.ndarray) -> tuple[float, float] | None:
@@ -215,41 +199,27 @@ def share_of(whole: np.ndarray, missing: np.ndarray) -> tuple[float, float] | No
 
     Returns None if `whole` is not significantly different from 0.
     """
-    limit = student(*whole.shape)
-    mean, error = _mean(whole)
-    size = np.square(mean).sum() - np.square(error).sum()
-    if size <= limit**2 * np.square(error).sum():
+    limit, count = student(*whole.shape), len(whole)
+    (part, part_noise), (size, noise) = _squared_mean(missing), _squared_mean(whole)
+    if size <= limit**2 * noise:
         return None
-    part, error = _mean(missing)
-    count, sums = len(whole), (_sums(missing), _sums(whole))
-    found = float(_ratio(count, *sums))
-    if np.square(part).sum() <= limit**2 * np.square(error).sum():
-        return found, float(np.sqrt(np.square(error).sum() / size))
+    found = _ratio(missing, whole)
+    if part + part_noise <= limit**2 * part_noise:
+        return found, float(np.sqrt(part_noise / size))
     # The noise of the part and of the whole: leave out one seed at a time (jackknife).
-    without = [[total - own for total, own in zip(each, (samples, np.square(samples)), strict=True)]
-               for each, samples in zip(sums, (missing, whole), strict=True)]  # fmt: skip
-    return found, float(np.sqrt(jackknife_variance(_ratio(count - 1, *without))))
+    without = [_ratio(np.delete(missing, k, 0), np.delete(whole, k, 0)) for k in range(count)]
+    return found, float(np.sqrt(jackknife_variance(np.array(without))))
 
 
-def _sums(samples: np.ndarray) -> list[np.ndarray]:
-    """Return the sums (K,) of samples (N, K), and of their squares."""
-    return [samples.sum(0), np.square(samples).sum(0)]
+def _ratio(part: np.ndarray, whole: np.ndarray) -> float:
+    """Return rms(part) / rms(whole) for samples (N, K). rms is the root mean square of the means, without noise."""
+    return float(np.sqrt(max(_squared_mean(part)[0], 0.0) / _squared_mean(whole)[0]))
 
 
-def _ratio(count: int, part: Sequence[np.ndarray], whole: Sequence[np.ndarray]) -> np.ndarray:
-    """Return rms(part) / rms(whole), where rms is the root mean square of means (..., K). The arguments are sums of
-    `count` samples and of their squares. The part due to noise is subtracted.
-    """
-    sizes = []
-    for total, squares in (part, whole):
-        mean = np.square(total / count)
-        sizes.append((mean - (squares / count - mean) / (count - 1)).sum(-1))
-    return np.asarray(np.sqrt(np.maximum(sizes[0], 0) / sizes[1]))
-
-
-def _mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (K,) of samples (N, K), and its standard error."""
-    return samples.mean(0), samples.std(0, ddof=1) / np.sqrt(len(samples))
+def _squared_mean(samples: np.ndarray) -> tuple[float, float]:
+    """Return the squared norm of the mean of samples (N, K) without the part due to noise, and that part."""
+    noise = float(samples.var(0, ddof=1).sum()) / len(samples)
+    return float(np.square(samples.mean(0)).sum()) - noise, noise
 
 
 #: Maximum numbers of seeds and views.
@@ -346,16 +316,18 @@ class MissingCheck:
             segments.append(tracing.weigh(segment, self.problem, self.views, self.image_spp))
         if not any(np.any(weights) for segment in segments for weights in segment.weights):
             return MissingRecord(self.source, key, None, None, len(directions), 0)
-        found, look = Missing(segments), fewest
+        samples, look = np.zeros((0, len(segments), 2)), fewest
         while True:
-            found.take(tracing, seeds(most)[found.count : found.count + FEWEST])
-            if looks and found.count == look:
-                if found.record(self.source, key).is_decided:
+            count = len(samples)
+            samples = np.concatenate([samples, tracing.samples(segments, seeds(most)[count : count + FEWEST])])
+            count = len(samples)
+            if looks and count == look:
+                if missing_record(self.source, key, samples).is_decided:
                     break
                 look *= GROWTH
-            if found.count == most or not affords(min(FEWEST, most - found.count) * at_a_seed):
+            if count == most or not affords(min(FEWEST, most - count) * at_a_seed):
                 break
-        return found.record(self.source, key)
+        return missing_record(self.source, key, samples)
 
 
 def _size(box: Any) -> float:

@@ -21,7 +21,7 @@ import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure import missing
 from reslrb_cli.measure.gradients import Case, Direction
-from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing, measure_missing, share_of
+from reslrb_cli.measure.missing import LineSegment, MissingCheck, Tracing, measure_missing, missing_record, share_of
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.manifest import read_manifest
@@ -193,7 +193,7 @@ def test_the_scene_moves_once_for_each_place(experiment: Path, monkeypatch: pyte
         np.testing.assert_allclose(found, expected, rtol=1e-4)
     assert len(moves) == 1
     segments = [LineSegment(np.eye(2)[k], -0.1, 0.1, [np.array(case.weights)] * 2) for k in (0, 1)]
-    Missing(segments).take(check.tracing, range(3))
+    check.tracing.samples(segments, range(3))
     assert len(moves) == 1 + 2 * (2 + 3)
 
 
@@ -401,11 +401,10 @@ def test_long_segments_have_no_truncation_error():
         gradient_of=lambda *_, **__: np.array([3 * np.cos(3 * bent.at)]),
     )  # fmt: skip
     bent = Bent([case], None, None, 1)
-    found = Missing([LineSegment(np.ones(1), -0.1, 0.5, [np.ones(1)])])
-    found.take(bent, range(400))
-    record = found.record("a.yaml", "x")
+    found = bent.samples([LineSegment(np.ones(1), -0.1, 0.5, [np.ones(1)])], range(400))
+    record = missing_record("a.yaml", "x", found)
     assert not record.is_incomplete, record
-    middle = 3 * np.cos(0.6) / found.differences[0][0] - 1
+    middle = 3 * np.cos(0.6) / found[0, 0, 0] - 1
     assert middle > 2 * record.margin, "the derivative in the middle would look incomplete"
 
 

@@ -24,7 +24,7 @@ from measure.moving_light import SCENES, setting
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure import missing as missing_check
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.missing import LineSegment, Missing, MissingCheck, Tracing, _ratio, _sums
+from reslrb_cli.measure.missing import LineSegment, MissingCheck, Tracing, _ratio, missing_record
 from reslrb_cli.measure.scenes.analytic import fresnel
 from reslrb_cli.measure.scenes.case import SceneCase
 from reslrb_cli.measure.scenes.moving import Displacement, Move, Pose, smooth_fields, vertices
@@ -49,9 +49,8 @@ def share(scene: SceneCase, count: int = SEEDS) -> tuple[float, float]:
     case, options = scene.setup(), scene.options
     tracer = integrator("reslrb", **options, estimator="stack")
     tracing = Tracing([case], integrator("walk_ad", **options), tracer, SPP)
-    found = Missing([LineSegment(np.ones(1), -REACH, REACH, [centre_of_gravity()])])
-    found.take(tracing, seeds(count))
-    record = found.record("", "")
+    segment = LineSegment(np.ones(1), -REACH, REACH, [centre_of_gravity()])
+    record = missing_record("", "", tracing.samples([segment], seeds(count)))
     assert record.share is not None
     assert record.standard_error is not None
     print(scene.name, record)
@@ -143,12 +142,7 @@ def test_a_fault_is_found(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_part_lost_in_noise_has_no_share():
-    random = np.random.default_rng(0)
-    found = Missing([LineSegment(np.ones(2), -1, 1)] * 2)
-    for _ in range(16):
-        found.ours.append(random.normal(size=2))
-        found.differences.append(random.normal(size=2))
-    record = found.record("a.yaml", "lamp.position")
+    record = missing_record("a.yaml", "lamp.position", np.random.default_rng(0).normal(size=(16, 2, 2)))
     assert record == MissingRecord("a.yaml", "lamp.position", None, None, 2, 16)
     assert record.line() == "lamp.position: 16 seeds cannot distinguish the derivative from 0"
 
@@ -157,12 +151,9 @@ def test_errors_are_correct():
     """Over many simulated measurements, the deviation from the known share is about as large as the stated error."""
     random, z = np.random.default_rng(1), []
     for _ in range(300):
-        found = Missing([LineSegment(np.ones(3), -1, 1)] * 3)
-        for _ in range(12):
-            common = random.normal(scale=0.3, size=3)
-            found.ours.append(np.array([1.0, 2.0, 0.5]) + common)
-            found.differences.append(np.array([1.5, 2.0, 1.0]) + common + random.normal(scale=0.05, size=3))
-        record = found.record("a.yaml", "x")
+        common = random.normal(scale=0.3, size=(12, 3))
+        ours, whole = np.array([1.0, 2.0, 0.5]) + common, np.array([1.5, 2.0, 1.0]) + common
+        record = missing_record("a.yaml", "x", np.stack([whole + random.normal(scale=0.05, size=(12, 3)), ours], 2))
         z.append(((record.share or 0) - np.sqrt(0.5 / 7.25)) / (record.standard_error or 1))
     assert abs(np.mean(z)) < 0.3
     assert 0.8 < np.std(z) < 1.3
@@ -171,7 +162,7 @@ def test_errors_are_correct():
 def test_noise_does_not_enlarge_a_share():
     """For two seeds, the square of the mean without its noise is the product of both samples."""
     part, whole = np.array([[1.0], [4.0]]), np.array([[4.0], [4.0]])
-    assert _ratio(2, _sums(part), _sums(whole)) == pytest.approx(0.5)
+    assert _ratio(part, whole) == pytest.approx(0.5)
 
 
 call = partial(ended, "gradcheck")

@@ -40,7 +40,7 @@ from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.views import View, slope, to_tensor
 from reslrb_cli.records.clock import StepClock, StepTimes
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array, jackknife_variance, special, sum_of_squares
+from reslrb_cli.statistics import Array, jackknife_variance, special, squares_without, sum_of_squares
 
 #: Relative error of a single time that must not decide anything.
 TIMING_NOISE = 1.1
@@ -133,15 +133,10 @@ def _log_variances(gradients: Sequence[Gradients], squares: dict[str, float]) ->
         np.concatenate([g[key].astype(np.float64) / math.sqrt(square) for key, square in squares.items()])
         for g in gradients
     ])  # fmt: skip
-    count = len(rows)
-    distances = np.square(rows - rows.mean(axis=0)).sum(axis=1)
-    whole = float(distances.sum())
-    # Leave-one-out: dropping a row lowers the sum of squares by its squared distance and that of the mean of the
-    # others.
-    without = whole - distances * count / (count - 1)
+    whole, without = squares_without(rows)
     if not without.min() > ROUNDING * whole:
         return None
-    return math.log(whole / (count - 1)), np.log(without / (count - 2))
+    return math.log(whole / (len(rows) - 1)), np.log(without / (len(rows) - 2))
 
 
 # --- two ways in turns ------------------------------------------------------------------------------------------------
@@ -276,7 +271,8 @@ class Turns:
                 if found.gain is not None and found.gain[1] <= 1 <= found.gain[2]:
                     return replace(found, note=f"not decided in {self._limit_ms / 1e3:.2g} s", is_open=True)
                 return found
-            if round % self._sizes.rounds == 0 and self._is_clear():
+            # No more steps are needed if the other way is clearly better, or clearly not better.
+            if round % self._sizes.rounds == 0 and ((gain := self._gain(CLEAR)) is None or not gain[1] <= 1 <= gain[2]):
                 break
         return self._decided()
 
@@ -314,19 +310,13 @@ class Turns:
         return compare(own, self._times(False), other, self._times(True), confidence)
 
     def _image_gain(self) -> Gain | None:
-        """Return the gain in efficiency for the image. If images have their own samples, these samples give the gain.
-        Without separate image samples, the gradient's samples also give the image.
-        """
+        """Return the gain in efficiency for the image, from the samples of the gradient or from its own samples."""
         own, other = ([step.images for step in steps] for steps in self._steps)
-        times = [self._times(each) for each in (False, True)]
         if self._sizes.alone:  # time outside kernels counts once, with the gradient
-            times = [[step.image_ms for step in steps] for steps in self._steps]
-        return compare(own, times[0], other, times[1])
-
-    def _is_clear(self) -> bool:
-        """True if no more steps are needed. The alternative is then clearly better, or clearly not better."""
-        gain = self._gain(CLEAR)
-        return gain is None or gain[1] > 1 or gain[2] < 1
+            own_ms, other_ms = ([step.image_ms for step in steps] for steps in self._steps)
+        else:
+            own_ms, other_ms = self._times(False), self._times(True)
+        return compare(own, own_ms, other, other_ms)
 
     def _decided(self) -> Finding:
         if (count := len(self._steps[False])) < LEAST_ROUNDS:
