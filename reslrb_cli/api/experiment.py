@@ -349,11 +349,12 @@ def gradcheck(
                 raise ConfigError(name, "", f"is {value}; at least {least} are needed")
         keep_variant(config.variant, config.source)
         from reslrb_cli.measure.gradcheck import Gradcheck
-        from reslrb_cli.measure.participants import settings_of
+        from reslrb_cli.measure.methods import parse_checked
+        from reslrb_cli.measure.participants import CheckSettings
 
         gc.collect()  # earlier scenes and the gradients of their parameters would otherwise take part in the check
-        checked = settings_of(config, integrators, budget, seeds, spp, time.monotonic() - began)
-        check = Gradcheck(checked)
+        named = None if integrators is None else parse_checked(integrators)
+        check = Gradcheck(CheckSettings(config, named, budget, seeds, spp, time.monotonic() - began))
         with _scene_given_back(config):
             return list(check.run(stop, logger.info))
 

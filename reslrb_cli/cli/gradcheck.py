@@ -210,7 +210,7 @@ def command(**given: Any) -> int:
     load_packages()  # before the imports below need them
     from reslrb_cli.measure.draws import DrawsFile
     from reslrb_cli.measure.gradcheck import Gradcheck
-    from reslrb_cli.measure.participants import settings_of
+    from reslrb_cli.measure.participants import CheckSettings
     from reslrb_cli.report.tables import summary_lines
 
     options.check()
@@ -224,9 +224,8 @@ def command(**given: Any) -> int:
         variant = set_variant(config.variant)
         echo(f"{device_name(variant)}, {variant}")
         return run_missing(options, config, variant)
-    checked = settings_of(
-        config, options.integrators, options.budget, options.seeds, options.spp, time.monotonic() - began
-    )
+    named = None if options.integrators is None else parse_checked(options.integrators)
+    checked = CheckSettings(config, named, options.budget, options.seeds, options.spp, time.monotonic() - began)
     variant = set_variant(config.variant)
     check = Gradcheck(checked, file=DrawsFile(options.draws))
     limit = allowance(options.budget, options.seeds, "seed")

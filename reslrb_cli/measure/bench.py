@@ -11,7 +11,7 @@ and the output names the cases without results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -29,23 +29,19 @@ def bench_record(member: Member, baseline: Member, sizes: Mapping[str, Any]) -> 
     draws = member.draws
     figures: dict[str, Any] = {name: sizes.get(name) for name in ("width", "height", "texels")}
     if member.status is BenchStatus.OK:
-        tracing_ms = np.maximum(draws.step_ms - draws.kernel_ms - draws.codegen_ms, 0.0)
-        times = {"step_ms": draws.step_ms, "kernel_ms": draws.kernel_ms, "codegen_ms": draws.codegen_ms}
-        figures |= {name: _spread(time) for name, time in (times | {"tracing_ms": tracing_ms}).items()}
-        figures |= {name: getattr(draws, name) for name in ("cold_ms", "peak_mib", "scratch_bytes")}
-        figures["repeats"] = len(member.kept)
+        times = {name: getattr(draws, name) for name in ("step_ms", "kernel_ms", "codegen_ms")}
+        times["tracing_ms"] = np.maximum(draws.step_ms - draws.kernel_ms - draws.codegen_ms, 0.0)
         if baseline.status is BenchStatus.OK:
             _, own, its = np.intersect1d(draws.seeds, baseline.draws.seeds, return_indices=True)
-            for name, times_of in (("step_ratio", "step_ms"), ("kernel_ratio", "kernel_ms")):
-                own_ms, its_ms = getattr(draws, times_of)[own], getattr(baseline.draws, times_of)[its]
-                figures[name] = _spread(own_ms[its_ms > 0] / its_ms[its_ms > 0])
+            for name in ("step", "kernel"):
+                own_ms, its_ms = times[f"{name}_ms"][own], getattr(baseline.draws, f"{name}_ms")[its]
+                times[f"{name}_ratio"] = own_ms[its_ms > 0] / its_ms[its_ms > 0]
+        for name, values in times.items():
+            known = values[~np.isnan(values)].tolist()
+            figures[name] = Spread.of(known) if known else None
+        figures |= {name: getattr(draws, name) for name in ("cold_ms", "peak_mib", "scratch_bytes")}
+        figures["repeats"] = len(member.kept)
     return BenchRecord(member.method, member.status, message=member.reason, **figures)
-
-
-def _spread(values: np.ndarray) -> Spread | None:
-    """Return the spread of all values except NaN, or None if every value is NaN."""
-    known = values[~np.isnan(values)]
-    return Spread.of(known.tolist()) if len(known) else None
 
 
 class Bench(Engine):
@@ -60,15 +56,14 @@ class Bench(Engine):
         super().__init__(plan, stop, say, BENCH_ROUNDS, **given)
         self.runs, self.left_out = dict[int, list[Member]](), list[NamedIntegrator]()
 
-    def results(self) -> list[BenchRecord]:
-        """Return the results so far, in the order of the sweep."""
-        return [record for value in self.runs for record in self._results(value)]
-
-    def _results(self, value: int) -> list[BenchRecord]:
-        runs = self.runs[value]
-        baseline = next(run for run in runs if run.case == self.plan.baseline)
-        done = [run for run in runs if run.status in (BenchStatus.OUT_OF_MEMORY, BenchStatus.FAILED) or run.kept]
-        return [bench_record(run, baseline, self.sizes) for run in done]
+    def results(self, values: Iterable[int] | None = None) -> list[BenchRecord]:
+        """Return the results so far, in the order of the sweep, by default for all values."""
+        found = []
+        for runs in (self.runs[value] for value in (self.runs if values is None else values)):
+            baseline = next(run for run in runs if run.case == self.plan.baseline)
+            done = [run for run in runs if run.status in (BenchStatus.OUT_OF_MEMORY, BenchStatus.FAILED) or run.kept]
+            found += [bench_record(run, baseline, self.sizes) for run in done]
+        return found
 
     def measure(self) -> Iterator[list[BenchRecord]]:
         """Measure. Yields an empty list after each round, and a value's results when the value is finished. Prints
@@ -77,10 +72,16 @@ class Bench(Engine):
         plan, values, stopped = self.plan, self.plan.values, False
         for number, value in enumerate(values):
             if self.is_late():
-                self.say(f"not measured: {plan.name(*values[number:])}: {NO_TIME}")
+                self.say(f"not measured: {plan.swept} {', '.join(map(str, values[number:]))}: {NO_TIME}")
                 return
-            cases = [case for case in plan.cases if case not in self.left_out]
-            self.members = self.runs[value] = [self._member(case, value) for case in cases]
+            self.members = self.runs[value] = []
+            for case in (case for case in plan.cases if case not in self.left_out):
+                config = plan.at(case, value)
+                self.members.append(Member(
+                    case=case, config=config, label=case.label, quantity="step", spp=config.run.spp, purpose="image",
+                    about={"label": case.label, "value": value}, file=self.file,
+                    may_refuse=plan.default and case != plan.baseline,
+                ))  # fmt: skip
             try:
                 for _ in self.begin(self.members, {}):
                     pass
@@ -94,15 +95,7 @@ class Bench(Engine):
                     self.say(f"left out: {run.label}: {run.reason}")
                     self.left_out.append(run.case)
             if self.unmeasured and not stopped:
-                self.say(f"not measured: {plan.name(value)}, {', '.join(self.unmeasured)}: {NO_TIME}")
-            yield self._results(value)
+                self.say(f"not measured: {plan.swept} {value}, {', '.join(self.unmeasured)}: {NO_TIME}")
+            yield self.results([value])
             if stopped:
                 return
-
-    def _member(self, case: NamedIntegrator, value: int) -> Member:
-        config = self.plan.at(case, value)
-        return Member(
-            case=case, config=config, label=case.label, quantity="step", spp=config.run.spp, purpose="image",
-            about={"label": case.label, "value": value}, file=self.file,
-            may_refuse=self.plan.default and case != self.plan.baseline,
-        )  # fmt: skip

@@ -13,9 +13,8 @@ import numpy as np
 
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.draws import StoredResults, mixed_sessions, situation
+from reslrb_cli.measure.draws import StoredResults, situation
 from reslrb_cli.measure.engine import NO_TIME, Engine, Member, Role
-from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import ROUNDS, MeasurementPlan, NamedIntegrator
 from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
 from reslrb_cli.records.decisions import key_of
@@ -52,17 +51,9 @@ class Session(Engine):
         self._arrays: Mapping[str, np.ndarray] = {}
         self._survey_about: dict[str, Any] = {}
 
-    def slices(self) -> dict[str, slice]:
-        """Return the place of each parameter (or of the image) in a sample."""
-        return places({key: int(np.prod(shape, dtype=int)) for key, shape in self.facts["shapes"].items()})
-
     def of(self, role: Role) -> list[Member]:
         """Return the members of one role."""
         return [member for member in self.members if member.role == role]
-
-    def mixed_sessions(self) -> str:
-        """Return a warning if efficiencies compare times of several sessions, or an empty text."""
-        return mixed_sessions(member.draws for member in self.of("case"))
 
     def measure(self) -> Iterator[int]:
         """Measure. Yields the number of completed rounds after each round."""

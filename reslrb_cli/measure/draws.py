@@ -96,32 +96,24 @@ class Draws:
     def __len__(self) -> int:
         return len(self.seeds)
 
-    @property
-    def sessions(self) -> list[str]:
-        """Sessions of the draws, in the order of the seeds."""
-        return list(dict.fromkeys(self.origin.tolist()))
-
-    def where(self, chosen: Array | slice) -> Draws:
-        """Return the draws in the rows `chosen`, a mask, indices or a slice."""
-        return replace(self, **{name: getattr(self, name)[chosen] for name in ARRAYS})
-
     @staticmethod
     def joined(parts: Sequence[Draws]) -> Draws:
         """Return the draws of all parts, which belong to one method, by increasing seed. If several parts have a seed,
         the first part counts. Figures of the first step are from the first part that has them.
         """
         filled = [part for part in parts if len(part)] or [parts[0]]
-        fields: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in filled]) for name in ARRAYS}
+        chosen = np.unique(np.concatenate([part.seeds for part in filled]), return_index=True)[1]
+        fields: dict[str, Any] = {
+            name: np.concatenate([getattr(part, name) for part in filled])[chosen] for name in ARRAYS
+        }
         for name in FIRST_STEP:
-            known = (value for part in parts if (value := getattr(part, name)) is not None)
-            fields[name] = next(known, None)
-        whole = replace(parts[0], **fields)
-        return whole.where(np.unique(whole.seeds, return_index=True)[1])
+            fields[name] = next((value for part in parts if (value := getattr(part, name)) is not None), None)
+        return replace(parts[0], **fields)
 
 
 def mixed_sessions(draws: Iterable[Draws]) -> str:
     """Return a warning if times of several sessions are compared, or an empty text."""
-    found = sorted({session for one in draws for session in one.sessions})
+    found = sorted({session for one in draws for session in one.origin.tolist()})
     if len(found) < 2:
         return ""
     return f"times are from {len(found)} sessions, so ratios of times may compare machines: {'; '.join(found)}"
@@ -181,17 +173,17 @@ class DrawsFile:
 
     def draws(self, about: Mapping[str, Any]) -> Draws | None:
         """Return the draws of a situation, or None if there are none."""
-        return self._whole(key_of(dict(about)))
+        key = key_of(dict(about))
+        return self._whole(key) if key in self._parts else None
 
     def __iter__(self) -> Iterator[Draws]:
         """Yield all draws of the file."""
-        return (whole for key in self._parts if (whole := self._whole(key)) is not None)
+        return map(self._whole, self._parts)
 
-    def _whole(self, key: str) -> Draws | None:
-        parts = self._parts.get(key)
-        if parts is not None and len(parts) > 1:
-            parts[:] = [Draws.joined(parts)]
-        return parts[0] if parts else None
+    def _whole(self, key: str) -> Draws:
+        parts = self._parts[key]
+        parts[:] = [Draws.joined(parts)] if len(parts) > 1 else parts
+        return parts[0]
 
     def add(self, about: Mapping[str, Any], draws: Draws) -> None:
         """Add draws of a situation. Draws with seeds that are on file already are dropped."""
@@ -230,9 +222,8 @@ class DrawsFile:
             return
         if self._state() not in (None, self._seen):
             self._read()
-        kept = {key: whole for key in self._parts if (whole := self._whole(key)) is not None}
         entries, arrays = [], dict[str, Array]()
-        for number, (key, one) in enumerate(kept.items()):
+        for number, (key, one) in enumerate(zip(self._parts, self, strict=True)):
             arrays |= {f"{number}/{name}": getattr(one, name) for name in ARRAYS}
             first = {name: getattr(one, name) for name in FIRST_STEP}
             entries.append({"about": self._about[key], "label": one.label, "options": dict(one.options), **first})

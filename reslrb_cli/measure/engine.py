@@ -104,21 +104,15 @@ class Member:
         self.process.ask({"numbers": [*range(first, first + steps)], "image": turn, "spp": self.spp, "cold": cold,
                           "release": release})  # fmt: skip
 
-    def keep(self, turn: int, answer: Mapping[str, Any]) -> None:
-        """Keep the draws of a whole turn."""
-        times = {name: np.array(answer[name]) for name in ("step_ms", "kernel_ms", "codegen_ms")}
-        for row in times.values():
-            row[0] = np.nan
-        numbers = range(turn * self.count, (turn + 1) * self.count)
-        self._add(answer["values"], numbers, **times)
-        self.kept.add(turn)
-
-    def keep_first(self, answer: Mapping[str, Any]) -> None:
-        """Keep the figures of the first step of the process."""
-        figures = {name: answer[name] for name in ("peak_mib", "scratch_bytes")}
-        self._add((), range(0), cold_ms=answer["step_ms"][0], **figures)
-
-    def _add(self, values: Any, numbers: range, **figures: Any) -> None:
+    def keep(self, answer: Mapping[str, Any], turn: int | None = None) -> None:
+        """Keep the draws of a whole turn. Without a `turn`, keep the figures of the first step of the process."""
+        if turn is None:
+            values, numbers, figures = (), range(0), {name: answer[name] for name in ("peak_mib", "scratch_bytes")}
+            figures["cold_ms"] = answer["step_ms"][0]
+        else:
+            values, numbers = answer["values"], range(turn * self.count, (turn + 1) * self.count)
+            figures = {name: np.array([np.nan, *answer[name][1:]]) for name in ("step_ms", "kernel_ms", "codegen_ms")}
+            self.kept.add(turn)
         self.file.add(self.about, Draws.of(self.label, values, numbers, options=self.case.options, **figures))
 
     def close(self) -> None:
@@ -211,13 +205,13 @@ class Engine:
         """Take the turns that are not on file. Yields the number of completed rounds after each round."""
         tight = self._is_tight()
         for turn in range(self.most):
-            lacking = [member for member in self._at_work() if turn not in member.kept]
+            lacking = [member for member in self.members if member.process is not None and turn not in member.kept]
             start = turn % max(len(lacking), 1)  # the first one changes from round to round
             for member in [*lacking[start:], *lacking[:start]]:
                 member.ask(turn, member.count, tight)
                 answer = self._answer(member)
                 if answer is not None:
-                    member.keep(turn, answer)
+                    member.keep(answer, turn)
             if self.is_late():
                 return
             if lacking:
@@ -235,12 +229,9 @@ class Engine:
                 self.say(line)
         return answer
 
-    def _at_work(self) -> list[Member]:
-        return [member for member in self.members if member.process is not None]
-
     def _is_tight(self) -> bool:
         """True if processes together use so much memory that each must release memory after each step."""
-        mib = sum(member.draws.peak_mib or 0.0 for member in self._at_work())
+        mib = sum(member.draws.peak_mib or 0.0 for member in self.members if member.process is not None)
         return mib * 2**20 > MEMORY_SHARE * memory_bytes(self.plan.variant)
 
     def _answer(self, member: Member) -> dict[str, Any] | None:
@@ -273,6 +264,6 @@ class Engine:
                 return
             member.step_s = answer["step_ms"][-1] / 1e3
             if cold:
-                member.keep_first(answer)
+                member.keep(answer)
             elif not answer["new_kernels"]:
                 return

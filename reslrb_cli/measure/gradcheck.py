@@ -38,6 +38,7 @@ from reslrb_cli.measure.gradients import seeds
 from reslrb_cli.measure.methods import plays_roulette
 from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
+from reslrb_cli.scene.catalog import value_shape
 
 #: Default number of seeds.
 SEEDS = 16
@@ -85,7 +86,6 @@ class Gradcheck:
         self.participants, self.file = Participants(settings), file or DrawsFile()
         self.draws: dict[Name, list[np.ndarray]] = {}
         self._about: dict[Name, dict[str, Any]] = {}
-        self._on_file: dict[Name, int] = {}
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -97,7 +97,7 @@ class Gradcheck:
         shown += [(listed.label, parts.ways[listed.label]) for listed in parts.listed if listed.type == "custom"]
         images = [(label, way, parts.images[way][0]) for label, way in shown]
         found = [Row(None, label, one, Kind.IMAGE, way) for label, way, one in images if one is not None]
-        plain = [label for label, config in self.settings.configs().items() if _draws_plainly(config)]
+        plain = [label for label, config in self.settings.configs.items() if _draws_plainly(config)]
         for key in parts.case.keys:
             for listed in parts.listed:
                 ours = listed.type == "reslrb" and listed.label in plain
@@ -134,7 +134,7 @@ class Gradcheck:
             for _ in self._turns(stop, say):
                 between()
         finally:
-            self._save()
+            self.file.save()
 
     def _turns(self, stop: Callable[[], bool], say: Callable[[str], None]) -> Iterator[None]:
         names = list(dict.fromkeys(name for row in self.rows for name in self._needs(row)))
@@ -149,12 +149,10 @@ class Gradcheck:
                     continue
                 if stop() or self._now() - self._begin >= self._budget_s:
                     return
-                if name[0] == "differences" and not self.draws[name]:
-                    self.participants.choose_steps(name[1])
-                self.draws[name].append(self.participants.sample(*name, seed).astype(np.float32))
+                self._take(name, seed)
                 yield
             if number & (number + 1) == 0:
-                self._save()
+                self.file.save()
                 say(f"{number + 1} of {self.seeds} seeds, {self._now() - self._begin:.0f} s")
 
     def _recall(self, name: Name) -> list[np.ndarray]:
@@ -165,19 +163,17 @@ class Gradcheck:
         found, stored = self.file.draws(about), self.file.stored(about)
         if found is None or stored is None or found.seeds.tolist() != list(seeds(len(found))):
             return []
-        self._on_file[name] = len(found)
         self.participants.restore(name[1], stored.facts)
         return list(found.values)[: self.seeds]
 
-    def _save(self) -> None:
-        """Write new samples to the file, with the facts that belong to them."""
-        for name, rows in self.draws.items() if self.file.path is not None else ():
-            if len(rows) > (known := self._on_file.get(name, 0)):
-                about = self._about[name]
-                self.file.add(about, Draws.of(about["purpose"], rows[known:], seeds(len(rows))[known:]))
-                self.file.store(about, StoredResults(self.participants.facts(name[1]), {}))
-                self._on_file[name] = len(rows)
-        self.file.save()
+    def _take(self, name: Name, seed: int) -> None:
+        """Take a sample, and add it to the file with the facts that belong to it."""
+        if name[0] == "differences" and not self.draws[name]:
+            self.participants.choose_steps(name[1])
+        self.draws[name].append(self.participants.sample(*name, seed).astype(np.float32))
+        if (about := self._about.get(name)) is not None:
+            self.file.add(about, Draws.of(about["purpose"], self.draws[name][-1], [seed]))
+            self.file.store(about, StoredResults(self.participants.facts(name[1]), {}))
 
     def records(self, interrupted: bool = False) -> list[GradcheckRecord]:
         """Return the comparisons of the samples so far, in the order of `rows`, and the parameters without a stock
@@ -223,7 +219,7 @@ class Gradcheck:
             return len(parts.directions[row.place])
         if row.reference is Reference.ANALYTIC:
             return len(parts.exact[row.key])
-        return entry_count(parts.shape(row.key))
+        return entry_count(value_shape(parts.case.values.value(row.key)))
 
     def _compared(self, row: Row, family: Family, why: str) -> GradcheckRecord:
         """Return the comparison of a row's samples. `why` is the reason if there are too few samples."""
@@ -247,16 +243,12 @@ class Gradcheck:
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
         else:
-            place, chosen, rounding = (
-                parts.case.places[row.key],
-                parts.directions[row.place],
-                parts.case.rounding(row.key),
-            )
-            ours = ours[:, place]
+            place, chosen = parts.case.places[row.key], parts.directions[row.place]
+            ours, rounding = ours[:, place], parts.case.rounding(row.key)
             if row.reference in ALONG_DIRECTIONS:
                 ours = ours @ np.array([direction.vector[place] for direction in chosen]).T
             elif its:
-                reference, shape = reference[:, place], parts.shape(row.key)
+                reference, shape = reference[:, place], value_shape(parts.case.values.value(row.key))
             if row.reference is Reference.FINITE_DIFFERENCE:
                 bias = np.array([direction.truncation for direction in chosen])
         if row.kind is Kind.EQUAL_SEEDS:
@@ -273,9 +265,9 @@ class Gradcheck:
         """Yield records for parameters without a stock reference."""
         parts = self.participants
         rows = [
-            (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION, way), parts.why[way.named(key)])
+            (Row(key, "reslrb", Reference.PTRACER, Kind.EXPECTATION, way), why)
             for way in dict.fromkeys(parts.way(listed, Reference.PTRACER) for listed in parts.listed)
-            for key in parts.case.keys if parts.stock[way.named(key)] is None
+            for key in parts.case.keys for reference, why in [parts.stock[way.named(key)]] if reference is None
         ]  # fmt: skip
         rows += [
             (Row(None, "reslrb", Reference.PATH, Kind.IMAGE, way), why)

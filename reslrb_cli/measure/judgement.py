@@ -18,8 +18,8 @@ The two variances are added.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,9 @@ from reslrb_cli.measure.comparison import (
     tail_weight,
 )
 from reslrb_cli.measure.convergence import FEWEST, Session
+from reslrb_cli.measure.draws import mixed_sessions
 from reslrb_cli.measure.engine import Member
+from reslrb_cli.measure.gradients import places
 from reslrb_cli.measure.methods import ALL, IMAGES
 from reslrb_cli.records.measurements import (
     FEWEST_AVERAGES,
@@ -47,7 +49,7 @@ from reslrb_cli.records.measurements import (
     ReferenceRecord,
     Verdict,
 )
-from reslrb_cli.statistics import jackknife_variance, special
+from reslrb_cli.statistics import jackknife_variance, special, squares_without
 
 #: Remark on noise with heavy tails.
 HEAVY = "single steps dominate the variance: the intervals are too narrow; take more steps"
@@ -70,16 +72,11 @@ class JackknifeEstimate:
     error: float
     freedom: float
 
-    def interval(self) -> Range:
-        """Return the interval by Student's t."""
-        half = float(special().stdtrit(min(self.freedom, 1e6), (1 + CONFIDENCE) / 2)) * self.error
-        return Range(self.value, self.value - half, self.value + half)
-
     def exponential(self) -> Range:
-        """Return the interval of exp(value). The value of this estimate is a logarithm."""
-        own = self.interval()
-        low, value, high = np.exp(np.clip([own.low, own.value, own.high], -700, 700))
-        return Range(float(value), float(low), float(high))
+        """Return exp(value) with its interval by Student's t. The value of this estimate is a logarithm."""
+        half = float(special().stdtrit(min(self.freedom, 1e6), (1 + CONFIDENCE) / 2)) * self.error
+        value, low, high = np.exp(np.clip(self.value + half * np.array([0, -1, 1]), -700, 700)).tolist()
+        return Range(value, low, high)
 
 
 class ReferenceMean:
@@ -92,12 +89,9 @@ class ReferenceMean:
     def __init__(self, rows: np.ndarray) -> None:
         self.rows, count = rows.astype(np.float64), len(rows)
         self.mean = self.rows.mean(0)
-        deviations = self.rows - self.mean
-        squares = np.square(deviations).sum(1)
-        # Leaving out a row lowers the sum of squares about the mean by K / (K - 1) times its own square.
-        left = (squares.sum() - squares * count / (count - 1)) / max(count - 2, 1) / (count - 1)
-        self.noises = np.array([squares.sum() / (count - 1) / count, *left])
-        self.moved = np.concatenate([np.zeros_like(deviations[:1]), -deviations / (count - 1)])
+        whole, without = squares_without(self.rows)
+        self.noises = np.array([whole / (count - 1) / count, *(without / max(count - 2, 1) / (count - 1))])
+        self.moved = np.concatenate([np.zeros_like(self.rows[:1]), (self.mean - self.rows) / (count - 1)])
         self.signals = np.square(self.mean + self.moved).sum(1) - self.noises
         self.noise, self.signal = float(self.noises[0]), float(self.signals[0])
 
@@ -110,30 +104,19 @@ class ReferenceMean:
 class MethodSamples:
     """Steps (R, P) of one method and their reference. `turns` (R,) is the turn of each step.
 
-    `seconds` (T,) has the time of one step in each turn.
+    `seconds` (T,) has the time of one step in each turn, and `step_s` is their mean. `variance` is the trace of the
+    variance of one step. Both `variance` and `squared_bias` are relative to the signal. An estimate of the squared bias
+    below 0 counts as 0.
     """
 
     def __init__(self, values: np.ndarray, turns: np.ndarray, seconds: np.ndarray, reference: ReferenceMean) -> None:
         self.reference, self.seconds = reference, np.asarray(seconds, np.float64)
         self.deviations = values.astype(np.float64) - reference.mean
-        self.turns = np.unique(turns, return_inverse=True)[1]
-        self.count = len(values)
-
-    @property
-    def step_s(self) -> float:
-        """Seconds per step, averaged over turns."""
-        return float(self.seconds.mean())
-
-    @cached_property
-    def variance(self) -> float:
-        """Trace of the variance of one step, relative to the signal."""
-        return float(self.deviations.var(0, ddof=1).sum() / self.reference.signal)
-
-    @cached_property
-    def squared_bias(self) -> float:
-        """Squared bias relative to the signal, or 0 if the estimate is negative."""
-        mean, variance = self.deviations.mean(0), self.variance * self.reference.signal
-        return max(0.0, float(mean @ mean - variance / self.count - self.reference.noise)) / self.reference.signal
+        self.turns, self.count = np.unique(turns, return_inverse=True)[1], len(values)
+        self.step_s = float(self.seconds.mean())
+        mean, variance = self.deviations.mean(0), float(self.deviations.var(0, ddof=1).sum())
+        squared_bias = float(mean @ mean) - variance / self.count - reference.noise
+        self.variance, self.squared_bias = variance / reference.signal, max(0.0, squared_bias) / reference.signal
 
     def _levels(self) -> list[tuple[int, np.ndarray, float]]:
         """Return averages of 1, 2, 4, ... steps, up to the number of steps: the length, the deviations of the averages
@@ -191,8 +174,8 @@ class MethodSamples:
         return float(0.5 * np.polyfit(np.log(steps), np.log(squared), 1, w=np.sqrt(repeats))[0])
 
     def efficiency(self) -> JackknifeEstimate | None:
-        """Return the logarithm of 1 / ((relative variance + squared relative bias) * seconds of a step). Without noise
-        or with too few turns, return None. An estimate of the squared bias below 0 counts as 0.
+        """Return the logarithm of 1 / ((variance + squared bias) * seconds of a step). Without noise or with too few
+        turns, return None.
         """
         turns, reference = int(self.turns.max()) + 1, self.reference
         if turns < FEWEST or len(self.seconds) != turns or self.variance <= 0 or reference.signal <= 0:
@@ -265,7 +248,12 @@ class Judgement:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._slices = session.slices() if session.facts else {}
+        shapes: Mapping[str, Sequence[int]] = session.facts.get("shapes", {})
+        self._shapes = {key: tuple(shape) for key, shape in shapes.items()}
+        self._slices = places({key: int(np.prod(shape, dtype=int)) for key, shape in shapes.items()})
+        #: All comparisons of the session have a common correction.
+        entries, members = sum(map(entry_count, self._shapes.values())), len(session.of("case")) + 1
+        self._family = Family(members * len(shapes), members * entries)
         #: Each parameter's slice, and the slice of all parameters together if there are several.
         self._places = self._slices if len(self._slices) == 1 else self._slices | {ALL: slice(None)}
         #: References of the errors, by parameter and for all; empty if there are too few steps of the reference.
@@ -306,8 +294,13 @@ class Judgement:
                 methods.append(self._method(member, key, biases.get(key, Bias()), own))
                 if self._has_figures(member, key):
                     points += self._samples(member, key).points(member.method, key)
-        stood = [self._stood(reference, key, bias) for key, bias in own.items() if reference is not None]
-        return ConvergenceResults(points, methods, stood, session.mixed_sessions())
+        stood = []
+        for key, bias in own.items():
+            assert reference is not None
+            figures = vars(bias) | ({"message": _UNSEEN} if self._whole[key].floor is None else {})
+            figures |= {"repeats": len(reference.draws), "reference_rmse": self._whole[key].floor}
+            stood.append(ReferenceRecord(method=reference.method, parameter=key, **figures))
+        return ConvergenceResults(points, methods, stood, mixed_sessions(member.draws for member in session.of("case")))
 
     def _is_measured(self, member: Member) -> bool:
         """Whether a member has enough finite samples."""
@@ -349,23 +342,15 @@ class Judgement:
         ours, theirs = member.draws.values[:, place].astype(np.float64), self._rows(judge, place)
         if member.role != "case":
             ours = self._rows(member, place)
+        # The source of the code that traces a member's paths: `reslrb`, or a stock integrator.
+        kin = {one.case.type if one.case.type in ("ptracer", "prb") else "ours" for one in (judge, member)}
         figures = compare_expectations(
-            ours,
-            theirs,
-            self._family(),
-            shape=tuple(self._session.facts["shapes"][key]),
-            paired=False,
-            reference_error=0.0 if _kin(judge) == _kin(member) else STOCK_ROUNDING,
-        )
+            ours, theirs, self._family, shape=self._shapes[key], paired=False,
+            reference_error=0.0 if len(kin) == 1 else STOCK_ROUNDING,
+        )  # fmt: skip
         biased = {Verdict.HOLDS: False, Verdict.FAILS: True}.get(figures.verdict)
         message = figures.message or ("gradient and reference differ" if biased else "")
         return Bias(figures.z_max, figures.z_max_limit, judge.label, biased, message)
-
-    def _family(self) -> Family:
-        """Return all comparisons of the session, which have a common correction."""
-        members = len(self._session.of("case")) + 1
-        shapes = self._session.facts["shapes"].values()
-        return Family(members * len(shapes), members * sum(entry_count(tuple(shape)) for shape in shapes))
 
     # --- records ------------------------------------------------------------------------------------------------------
 
@@ -407,18 +392,6 @@ class Judgement:
             extrapolated=[name for name, (_, beyond) in times.items() if beyond],
             **vars(replace(bias, message=message)),
         )
-
-    def _stood(self, member: Member, key: str, bias: Bias) -> ReferenceRecord:
-        floor = self._whole[key].floor
-        bias = bias if floor is not None else replace(bias, message=_UNSEEN)
-        figures: dict[str, Any] = {"repeats": len(member.draws), "reference_rmse": floor}
-        return ReferenceRecord(method=member.method, parameter=key, **figures, **vars(bias))
-
-
-def _kin(member: Member) -> str:
-    """Return the source of the code that traces a member's paths: `reslrb` or a stock integrator."""
-    name = member.case.type
-    return name if name in ("ptracer", "prb") else "ours"
 
 
 def _is_usable(member: Member) -> bool:

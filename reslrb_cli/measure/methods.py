@@ -347,10 +347,6 @@ class MeasurementPlan:
         roulette = name == "ptracer" and plays_roulette(own.max_depth, own.rr_depth)
         return NamedIntegrator(name, name, {"rr_depth": NEVER} if roulette else {}, "the independent reference")
 
-    def name(self, *values: int) -> str:
-        """Format values of the swept quantity, for example `depth 2, 4`."""
-        return f"{self.swept} {', '.join(map(str, values))}"
-
     def first(self, config: Config) -> dict[str, Any]:
         """Return the first message to a process that measures `config`."""
         return {"config": dump(config), "source": str(config.source), "variant": self.variant,

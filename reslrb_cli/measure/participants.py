@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ from reslrb_cli.integrators.protocol import StepIntegrator
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.measure.draws import situation
 from reslrb_cli.measure.gradients import Case, all_directions, choose_step, seeds, smooth_weights
-from reslrb_cli.measure.methods import NEVER, NamedIntegrator, all_estimators, parse_checked
+from reslrb_cli.measure.methods import NEVER, NamedIntegrator, all_estimators
 from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
@@ -37,7 +37,6 @@ from reslrb_cli.optimization.loading import check_integrator, paths_of, what_mov
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import multiple_of
 from reslrb_cli.records.measurements import Reference
-from reslrb_cli.scene.catalog import value_shape
 from reslrb_cli.scene.deformation import Moves
 from reslrb_cli.scene.graph import interpolates_normals
 from reslrb_cli.scene.visibility import interior
@@ -94,52 +93,30 @@ def shrink(scene: Any, sensor: int, pixels: int) -> None:
     params.update()
 
 
-@dataclass(frozen=True)
+@dataclass
 class CheckSettings:
     """Settings of a check. `seeds` and `spp` are None if they are chosen automatically.
 
-    - `named` tells whether the user named the integrators. Otherwise integrators that cannot take part are left out.
+    - `named` are the integrators that the user named, or None for all estimators that can take part.
     - `spent_s` is the part of the budget that earlier sessions used.
+    - `configs` has one experiment for each integrator, by label. Raises ConfigError if one is invalid.
     """
 
     config: Config
-    integrators: Sequence[NamedIntegrator]
+    named: Sequence[NamedIntegrator] | None
     budget_s: float
     seeds: int | None = None
     spp: int | None = None
-    named: bool = True
     spent_s: float = 0.0
 
-    @property
-    def known(self) -> bool:
-        """Whether dL/dI is known before the image, as in the steps of the experiment."""
-        return self.config.adjoint != "correlated"
-
-    def configs(self) -> dict[str, Config]:
-        """Return one experiment for each integrator, by label. Raises ConfigError if one is invalid."""
-        depth = self.config.integrator.max_depth
-        config = without_edges(self.config)
-        return {case.label: case.at(config, depth, self.known) for case in self.integrators}
-
-
-def without_edges(config: Config) -> Config:
-    """Return the experiment without the derivatives of edges, which only differences have."""
-    integrator = config.integrator
-    if integrator.options().get("edges") != "on":
-        return config
-    return config.model_copy(update={"integrator": integrator.model_copy(update={"edges": "off"})})
-
-
-def settings_of(
-    config: Config, integrators: str | None, budget_s: float, seeds: int | None, spp: int | None, spent_s: float
-) -> CheckSettings:
-    """Return the settings of a check of `config`. `integrators` is a list as text, or None for all estimators. Raises
-    ConfigError if an integrator is invalid.
-    """
-    listed = all_estimators(config) if integrators is None else parse_checked(integrators)
-    checked = CheckSettings(config, listed, budget_s, seeds, spp, integrators is not None, spent_s)
-    checked.configs()  # before anything is loaded
-    return checked
+    def __post_init__(self) -> None:
+        self.known = self.config.adjoint != "correlated"  # dL/dI is known before the image, as in a run's steps
+        self.integrators = all_estimators(self.config) if self.named is None else self.named
+        config, integrator = self.config, self.config.integrator
+        if integrator.options().get("edges") == "on":  # only differences have the derivatives of edges
+            config = config.model_copy(update={"integrator": integrator.model_copy(update={"edges": "off"})})
+        depth = integrator.max_depth
+        self.configs = {case.label: case.at(config, depth, self.known) for case in self.integrators}
 
 
 @dataclass(frozen=True)
@@ -177,9 +154,8 @@ class Participants:
     - `ways` maps the label of each estimator to the estimator's paths. If light moves, the paths are those of a run,
         but `OF_LIGHT_PATHS` are compared with the estimator's light paths (`way`). Dictionaries "by way" have names for
         each kind of paths (`Way.named`).
-    - `stock` has the stock reference for each parameter's gradient, or None. `why` has the reasons against the other
-        stock references.
-    - `images` has the reference of the image for each way. `exact` has gradients in closed form.
+    - `stock` has the stock reference for each parameter's gradient, or None, and the reasons against the others.
+    - `images` has the same of the image for each way. `exact` has gradients in closed form.
     - `listed` has the estimators that take part. If derivatives are attached, only estimators with attached derivatives
         on light paths take part.
     - `unguided` has the integrator of the unguided steps, by the label of each estimator that a run would or may guide.
@@ -190,7 +166,7 @@ class Participants:
     """
 
     def __init__(self, settings: CheckSettings) -> None:
-        self._config, self._configs, self.known = settings.config, settings.configs(), settings.known
+        self._config, self._configs, self.known = settings.config, settings.configs, settings.known
         # If objects move, the experiment has an estimator with derivatives of moving light.
         follow = [case for case in settings.integrators if case.options.get("estimator") in ATTACHED]
         first = self._configs[[*follow, *settings.integrators][0].label].with_exposures_fixed()
@@ -220,14 +196,13 @@ class Participants:
         for case in self.listed:
             self._add_listed(case)
         self._add_others(first.integrator.options())
-        self.stock: dict[str, Reference | None] = {}
-        self.why: dict[str, str] = {}
-        self.images: dict[Way, tuple[Reference | None, str]] = {}
-        self._of: dict[str, tuple[str, Way]] = {}
-        self._find_references()
-        seen = {reference for reference, _ in self.images.values()}
-        self.masked = self._are_unlike(seen)
-        self._weigh(self._are_unlike({*self.stock.values(), *seen}))
+        at = {way: replace(self._situation, paths=way.paths) for way in self.each_way}
+        rendered = Reference.PTRACER, Reference.PATH, Reference.PRB
+        self.images = {way: choose(of_image(at[way], rendered)) for way in self.each_way}
+        self._of = {way.named(key): (key, way) for way in self.each_way for key in self.case.keys}
+        self.stock = {name: choose(of_gradient(at[way], key)) for name, (key, way) in self._of.items()}
+        self.masked = self._are_unlike(self.images.values())
+        self._weigh(self._are_unlike([*self.stock.values(), *self.images.values()]))
         along = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
         self.directions = {way.named(key): list(along[key]) for way in self.each_way for key in self.case.keys}
         weights = np.array(self.case.weights, np.float64)
@@ -246,10 +221,10 @@ class Participants:
                 self._check(case, self._configs[case.label], problem)
             except ConfigError as error:
                 refused[case.label] = error
-            if self._moved and "paths" in case.options and not settings.named:  # the others have the paths of a run
+            if self._moved and "paths" in case.options and settings.named is None:  # the others have a run's paths
                 refused.setdefault(case.label, ConfigError("--integrators", case.label, "repeats another estimator"))
         listed = [case for case in settings.integrators if case.label not in refused]
-        if refused and (settings.named or not listed):
+        if refused and (settings.named is not None or not listed):
             raise next(iter(refused.values()))
         return listed
 
@@ -355,29 +330,19 @@ class Participants:
 
     # --- references ---------------------------------------------------------------------------------------------------
 
-    def _find_references(self) -> None:
-        """Choose the stock references of images and gradients, by way."""
-        for way in self.each_way:
-            at = replace(self._situation, paths=way.paths)
-            for key in self.case.keys:
-                name = way.named(key)
-                self._of[name] = key, way
-                self.stock[name], self.why[name] = choose(of_gradient(at, key))
-            self.images[way] = choose(of_image(at, (Reference.PTRACER, Reference.PATH, Reference.PRB)))
-
     def references(self, key: str, listed: NamedIntegrator) -> list[Reference]:
         """Return the references that the scene allows for the gradient of a parameter by an integrator."""
         if listed.type == "custom" and self._moved:  # our camera paths have no derivatives of moving light
             return [Reference.FINITE_DIFFERENCE]
-        stock = self.stock[self.way(listed, Reference.PTRACER).named(key)]
+        stock, _ = self.stock[self.way(listed, Reference.PTRACER).named(key)]
         found = [Reference.WALK_AD] + ([] if stock is None else [stock])
         found += [Reference.ANALYTIC] if key in self.exact else []
         found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
         return found + ([Reference.UNGUIDED] if listed.label in self.unguided else [])
 
-    def _are_unlike(self, references: set[Reference | None]) -> bool:
+    def _are_unlike(self, references: Iterable[tuple[Reference | None, str]]) -> bool:
         """Whether some references lose light along the film's border and others do not."""
-        sides = {reference in CAMERA_PATHS for reference in references if reference is not None}
+        sides = {reference in CAMERA_PATHS for reference, _ in references if reference is not None}
         return len(sides | {divides_by_film(way.paths) for way in self.each_way}) > 1
 
     def _weigh(self, inside: bool) -> None:
@@ -393,10 +358,6 @@ class Participants:
         if inside:
             weights *= interior(shape, self.sensor)[:, :, None]
         self.case.weigh(weights)
-
-    def shape(self, key: str) -> tuple[int, ...]:
-        """Return the shape of a parameter."""
-        return value_shape(self.case.values.value(key))
 
     # --- samples ------------------------------------------------------------------------------------------------------
 
@@ -449,13 +410,9 @@ class Participants:
             return self.gradient(tracer, seed)
         if kind == "image":
             image = self.case.image(tracer, seed, self.spp)
-            if self.masked:
-                image *= interior(image.shape, self.sensor)[:, :, None]
-            return image.ravel()
+            return (image * interior(image.shape, self.sensor)[:, :, None] if self.masked else image).ravel()
         if kind == "differences":
-            return np.array(
-                [direction.difference(self.case, tracer, seed, self.spp) for direction in self.directions[of]]
-            )
+            return np.array([along.difference(self.case, tracer, seed, self.spp) for along in self.directions[of]])
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
     def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:

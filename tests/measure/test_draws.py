@@ -34,7 +34,7 @@ def equal(one: Draws, other: Draws) -> bool:
 def test_draws_of_one_session() -> None:
     draws = some(4, 2)
     assert (draws.values.dtype, draws.values.shape, len(draws)) == (np.float32, (2, 2), 2)
-    assert draws.sessions == [this_session()]
+    assert draws.origin.tolist() == [this_session()] * 2
     assert np.isnan(draws.kernel_ms).all()
     timed = Draws.of("prb", np.zeros((3, 0)), range(3), step_ms=2.0)
     assert (timed.values.shape, timed.step_ms.tolist()) == ((3, 0), [2.0] * 3)

@@ -205,7 +205,7 @@ def test_a_budget_ends_early(budget_s: float, seeds: int | None, counts: set[int
     """
     config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
     made = pretended(CheckSettings(config, estimators_of("stack,event"), budget_s, seeds), monkeypatch)
-    monkeypatch.setattr(made.participants, "shape", lambda key: (4,))
+    monkeypatch.setattr("reslrb_cli.measure.gradcheck.value_shape", lambda value: (4,))
     monkeypatch.setattr(made.participants.case, "weights", np.zeros(4))
     made.participants.case.places = dict.fromkeys(made.participants.case.places, slice(0, 4))
     for chosen in made.participants.directions.values():
@@ -460,7 +460,7 @@ def test_moving_lamps_have_only_light_paths():
 def test_differences_of_moving_shapes_have_the_paths_of_a_run(asked: str, paths: str):
     """Light paths lack terms that a run's camera paths have. All other references follow light paths alone."""
     config = load(CONFIGS / "moved_box.yaml", [*SMALL_BOX, f"integrator.paths={asked}"])
-    made = Gradcheck(CheckSettings(config, all_estimators(config), 0, 3, named=False))
+    made = Gradcheck(CheckSettings(config, None, 0, 3))
     parts, labels = made.participants, ["reslrb:reservoir", "reslrb:stack"]
     assert [case.label for case in parts.listed] == (labels if paths != "camera" else ["reslrb:stack"])
     found = {(row.reference, row.way.paths) for row in made.rows if row.key is not None}
@@ -612,18 +612,18 @@ def test_a_moving_lamp():
 
 def test_participants():
     config = room_moving("lamp_over_floor.xml", "lamp.position")
-    some = Gradcheck(CheckSettings(config, all_estimators(config), 0, 3, named=False))
+    some = Gradcheck(CheckSettings(config, None, 0, 3))
     assert [case.label for case in some.participants.listed] == ["reslrb:reservoir", "reslrb:stack"]
     assert {row.label for row in some.rows if row.key is not None} == {"reslrb:reservoir", "reslrb:stack"}
     with pytest.raises(ConfigError, match="gather has no derivatives of moving light; use reservoir, stack"):
         Gradcheck(CheckSettings(config, estimators_of("gather,stack"), 0, 3))
     still = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value")
-    all_of_them = Gradcheck(CheckSettings(still, all_estimators(still), 0, 3, named=False))
+    all_of_them = Gradcheck(CheckSettings(still, None, 0, 3))
     assert [case.label for case in all_of_them.participants.listed] == [
         *(f"reslrb:{name}" for name in ("reservoir", "gather", "event", "stack")), "reslrb:stack(paths=both)"
     ]  # fmt: skip
     asked = room_moving("lamp_over_floor.xml", "floor.bsdf.reflectance.value", overrides=["integrator.paths=light"])
-    assert len(Gradcheck(CheckSettings(asked, all_estimators(asked), 0, 3, named=False)).participants.listed) == 4
+    assert len(Gradcheck(CheckSettings(asked, None, 0, 3)).participants.listed) == 4
 
 
 def test_derivatives_of_the_film():
@@ -633,7 +633,7 @@ def test_derivatives_of_the_film():
     parts = Gradcheck(
         CheckSettings(room_moving("wavy_glass.xml", "top.vertex_positions"), estimators_of("stack"), 0, 3)
     ).participants
-    assert parts.stock == {"top.vertex_positions": Reference.PTRACER}
+    assert [(key, one) for key, (one, _) in parts.stock.items()] == [("top.vertex_positions", Reference.PTRACER)]
     assert parts.sampled("reslrb:stack", Reference.WALK_AD) == "reslrb:stack, as walk_ad"
     assert parts.sampled("reslrb:stack", Reference.FINITE_DIFFERENCE) == "reslrb:stack, as finite_difference"
     assert parts.sampled("reslrb:stack", Reference.PTRACER) == "reslrb:stack, as ptracer"
