@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from make_figures import encode
 
-from paper.gradients import OWN, Kind, colored, compare, fall, own_label, sample, take_pictures
+from paper.gradients import OWN, Kind, Sampling, colored, compare, fall
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
@@ -49,27 +49,25 @@ def plan(sets: list[str], seeds: int, _room: Path | None) -> tuple[Config, Plan]
 def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dict[str, Any], Any]:
     """Sample and check all gradients. Return the record, and the rows of panels of the picture.
 
-    Raises ConfigError, `processes.Refused`, and Ended if a required gradient is missing.
+    Raises ConfigError, `processes.CannotStart`, and Ended if a required gradient is missing.
     """
-    label = own_label(config)
     if config.parameters[0].heightmap is None:
         raise ConfigError(config.source, "parameters[0]", "must be a heightmap, whose gradient is shown")
-    say(f"target and initial image, {plan.reference_spp} spp")
-    pictures = take_pictures(config, plan.reference_spp)
+    made = Sampling(config, plan.reference_spp, say, limit=plan.limit)
+
+    def taken(name: str, spp: int, by: str, count: int, may_end: bool = False) -> Kind:
+        series = f"figure1, {'ours' if by == OWN else 'naive'}, {spp} spp"
+        return made.take(Kind(name, spp, by), count, series, may_end)
+
     # Memory grows in proportion to the samples, so two sample counts predict that of many.
-    half = Kind("naive AD", max(plan.few_spp // 2, 1), "ptracer")
-    naive, failing = (Kind("naive AD", spp, "ptracer") for spp in (plan.few_spp, plan.many_spp))
-    ours, many = (Kind(label, spp, OWN) for spp in (plan.few_spp, plan.many_spp))
-    for kind, count in ((half, 1), (naive, plan.seeds), (ours, plan.seeds), (many, plan.many_seeds), (failing, 1)):
-        say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
-        series = f"figure1, {'ours' if kind.by == OWN else 'naive'}, {kind.spp} spp"
-        sample(kind, count, config, pictures, series, plan.limit)
-        if kind.end is not None and kind is not failing:
-            raise kind.end
+    half = taken("naive AD", max(plan.few_spp // 2, 1), "ptracer", 1)
+    naive = taken("naive AD", plan.few_spp, "ptracer", plan.seeds)
+    ours = taken(made.own, plan.few_spp, OWN, plan.seeds)
+    many = taken(made.own, plan.many_spp, OWN, plan.many_seeds)
+    kinds = [naive, ours, many, taken("naive AD", plan.many_spp, "ptracer", 1, may_end=True)]
     growth = ((naive.arrays_mib or 0) - (half.arrays_mib or 0)) / (naive.spp - half.spp)
     asked_mib = (naive.arrays_mib or 0) + growth * (plan.many_spp - naive.spp)
-    kinds = [naive, ours, many, failing]
-    return judge(plan, kinds, asked_mib), panels(pictures.target, pictures.initial, kinds, plan.limit)
+    return judge(plan, kinds, asked_mib), panels(made.target, made.initial, kinds, plan.limit)
 
 
 def judge(plan: Plan, kinds: list[Kind], asked_mib: float) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from make_figures import encode
 
-from paper.gradients import OWN, Kind, colored, compare, compared, own_label, sample, take_pictures
+from paper.gradients import OWN, Kind, Sampling, colored, compare, compared
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
 from reslrb_cli.measure.comparison import Deviation, compare_equal_seeds, parts
@@ -58,28 +58,17 @@ def plan(sets: list[str], seeds: int, room: Path) -> tuple[Config, Plan]:
 def measure(config: Config, plan: Plan, say: Callable[[str], None]) -> tuple[dict[str, Any], Any]:
     """Sample and check all gradients. Return the record, and the rows of panels of the picture.
 
-    Raises ConfigError, `processes.Refused`, and Ended if a gradient is missing.
+    Raises ConfigError, `processes.CannotStart`, and Ended if a gradient is missing.
     """
-    label = own_label(config)
-    say(f"image and dL/dI, {plan.reference_spp} spp")
-    pictures = take_pictures(config, plan.reference_spp, masked=True)
-
-    def taken(name: str, by: str, count: int, series: str) -> Kind:
-        kind = Kind(name, plan.spp, by)
-        say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
-        sample(kind, count, config, pictures, f"figure5, {series}")
-        if kind.end is not None:
-            raise kind.end
-        return kind
-
-    sampled = {"naive AD": "walk_ad", label: OWN, "prb": "prb"}
-    kinds = [taken(name, by, plan.seeds, by) for name, by in sampled.items()]
-    exact = [taken(f"reslrb:{name}", name, 1, "walk_ad") for name in EXACT]
-    [adjoint] = pictures.arrays["adjoints"]
+    made = Sampling(config, plan.reference_spp, say, masked=True)
+    sampled = {"naive AD": "walk_ad", made.own: OWN, "prb": "prb"}
+    kinds = [made.take(Kind(name, plan.spp, by), plan.seeds, f"figure5, {by}") for name, by in sampled.items()]
+    exact = [made.take(Kind(f"reslrb:{name}", plan.spp, name), 1, "figure5, walk_ad") for name in EXACT]
+    [adjoint] = made.arrays["adjoints"]
     height, width, _ = adjoint.shape
     found = {"plan": asdict(plan), "film": [width, height], "max_depth": config.integrator.max_depth,
              "left_out": float(np.mean(~adjoint.any(-1)))}  # fmt: skip
-    return found | judge(kinds, exact), panels(pictures.initial, kinds)
+    return found | judge(kinds, exact), panels(made.initial, kinds)
 
 
 def judge(kinds: list[Kind], exact: list[Kind]) -> dict[str, Any]:

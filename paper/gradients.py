@@ -9,12 +9,11 @@ parameter, at the parameters' initial values, through the first sensor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.integrators import ReslrbConfig
@@ -22,7 +21,8 @@ from reslrb_cli.config.loader import dump, with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
-from reslrb_cli.measure.engine import start_process
+from reslrb_cli.measure.engine import STEPS, start_process
+from reslrb_cli.measure.judgement import jackknife
 from reslrb_cli.measure.methods import NEVER
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Ended
@@ -33,34 +33,20 @@ from reslrb_cli.records.measurements import Comparison, Reference, Verdict
 from reslrb_cli.records.metrics import finite
 from reslrb_cli.report.tonemap import color_map
 from reslrb_cli.scene.visibility import interior, sees_specular
-from reslrb_cli.statistics import jackknife_variance
+from reslrb_cli.statistics import special, squares_without
 
 #: On a GPU the address space of a process says nothing about the memory of its arrays.
 VARIANT = "llvm_ad_rgb"
 #: The integrator of the experiment itself.
 OWN = "own"
-#: Confidence of the interval of `fall`, and the relative half width of its test above which the ratio is not known.
-CONFIDENCE, WIDEST = 0.95, 0.2
-
-
-@dataclass
-class Pictures:
-    """The target and the initial image (H, W, C), and the arrays of a process (`steps.Sampler`) with dL/dI at the
-    initial image. `shape` is that of the first parameter.
-    """
-
-    target: np.ndarray
-    initial: np.ndarray
-    arrays: dict[str, np.ndarray]
-    shape: tuple[int, ...]
+#: Relative half width of the test of `fall` above which the ratio is not known.
+WIDEST = 0.2
 
 
 @dataclass
 class Kind:
     """One kind of gradient: `samples` (N, H, W, C) by the integrator `by` (see `comparable`), and the peak memory of
-    arrays.
-
-    `end` is the reason why the process ended before it took all samples. `end` is None otherwise.
+    arrays. `end` is the reason why the process ended before it took all samples, or None.
     """
 
     name: str
@@ -92,18 +78,66 @@ class Kind:
         }  # fmt: skip
 
 
-def own_label(config: Config) -> str:
-    """Return the label of the experiment's own estimator. Raises ConfigError if gradients of this experiment cannot be
-    compared.
+class Sampling:
+    """Samples of an experiment's gradients. `own` is the label of its estimator.
+
+    `target` and `initial` (H, W, C) are the target and the initial image, and `arrays` belong to a process
+    (`steps.Sampler`), with dL/dI at the initial image. `shape` is that of the first parameter. If `masked`, dL/dI is 0
+    where light paths find less light than camera paths. These pixels see smooth specular lobes or lie at the film's
+    border. `limit` bounds the address space of each process in bytes. Raises ConfigError if gradients of this
+    experiment cannot be compared.
     """
-    integrator = config.integrator
-    if config.variant not in ("auto", VARIANT):
-        raise ConfigError(config.source, "variant", f"must be auto or {VARIANT}: the limit bounds address space alone")
-    if not isinstance(integrator, ReslrbConfig) or integrator.estimator == "auto":
-        raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
-    if integrator.max_depth < 0:
-        raise ConfigError(config.source, "integrator.max_depth", "must be a limit: paths are traced without roulette")
-    return f"reslrb:{integrator.estimator}"
+
+    def __init__(
+        self, config: Config, spp: int, say: Callable[[str], None], masked: bool = False, limit: int | None = None
+    ) -> None:
+        self.config, self._say, self._limit, integrator = config, say, limit, config.integrator
+        if config.variant not in ("auto", VARIANT):
+            reason = f"must be auto or {VARIANT}: the limit bounds address space alone"
+            raise ConfigError(config.source, "variant", reason)
+        if not isinstance(integrator, ReslrbConfig) or integrator.estimator == "auto":
+            raise ConfigError(config.source, "integrator.estimator", "must name an estimator of `reslrb`")
+        if integrator.max_depth < 0:
+            reason = "must be a limit: paths are traced without roulette"
+            raise ConfigError(config.source, "integrator.max_depth", reason)
+        self.own = f"reslrb:{integrator.estimator}"
+        say(f"target, and initial image with {spp} spp")
+        set_variant(VARIANT)
+        problem = assemble(config.with_exposures_fixed())
+        view, self.shape = problem.views[0], problem.selection.array(problem.selection.keys[0]).shape
+        self.target, self.initial = np.array(view.target), problem.render(view.sensor, spp, 0, "reference")
+        mask = np.ones(self.initial.shape[:2], bool)
+        if masked:
+            sensor = problem.scene.sensors()[view.sensor]
+            mask = interior(mask.shape, sensor) & ~sees_specular(problem.scene, sensor, partly=True)
+        derivative = adjoint(problem, self.initial, mask[:, :, None].astype(np.float32))
+        self.arrays = {"adjoints": derivative[None], **target_arrays(problem.views[:1])}
+
+    def take(self, kind: Kind, count: int, series: str, may_end: bool = False) -> Kind:
+        """Take `count` gradients in a separate process. Kinds with the same `series` have the same seeds. Raises Ended
+        if the process ends, unless it `may_end`.
+        """
+        self._say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
+        config = self.config
+        first = {"config": dump(comparable(config, kind.by)), "source": str(config.source), "variant": VARIANT,
+                 "memory_limit": self._limit, "allow_code": False, "quantity": "fixed", "purpose": series,
+                 "arrays": self.arrays}  # fmt: skip
+        process, taken = start_process(first, f"{STEPS}:begin"), []
+        try:
+            process.answer(lambda: False)
+            for number in range(count):
+                process.ask({"numbers": [number], "spp": kind.spp, "image": 0, "cold": True, "release": False})
+                answer = process.answer(lambda: False)
+                kind.arrays_mib = max(kind.arrays_mib or 0.0, float(answer["peak_mib"]))
+                taken.append(answer["values"][0, : np.prod(self.shape)].reshape(self.shape))
+            kind.samples = np.stack(taken)
+        except Ended as end:
+            kind.end = end
+            if not may_end:
+                raise
+        finally:
+            process.close()
+        return kind
 
 
 def comparable(config: Config, by: str) -> Config:
@@ -112,7 +146,7 @@ def comparable(config: Config, by: str) -> Config:
 
     No integrator uses Russian roulette, because naive AD does not differentiate its decision.
     """
-    assert isinstance(config.integrator, ReslrbConfig), "checked by `own_label`"
+    assert isinstance(config.integrator, ReslrbConfig), "checked by `Sampling`"
     own = config.integrator.plain()
     if by in ("ptracer", "prb", "walk_ad"):
         values = {"type": by, "max_depth": own.max_depth, "rr_depth": NEVER, "hide_emitters": own.hide_emitters}
@@ -121,48 +155,6 @@ def comparable(config: Config, by: str) -> Config:
         return with_integrator(config, values, str(config.source), {})
     changed: dict[str, Any] = ALIKE[Reference.PTRACER] | {"rr_depth": NEVER} | ({} if by == OWN else {"estimator": by})
     return config.model_copy(update={"integrator": own.model_copy(update=changed)})
-
-
-def take_pictures(config: Config, spp: int, masked: bool = False) -> Pictures:
-    """Render the target, and the initial image with `spp` samples per pixel.
-
-    If `masked`, dL/dI is 0 where light paths find less light than camera paths. These pixels see smooth specular lobes
-    or lie at the film's border.
-    """
-    set_variant(VARIANT)
-    problem = assemble(config.with_exposures_fixed())
-    view, shape = problem.views[0], problem.selection.array(problem.selection.keys[0]).shape
-    initial = problem.render(view.sensor, spp, 0, "reference")
-    mask = np.ones(initial.shape[:2], bool)
-    if masked:
-        sensor = problem.scene.sensors()[view.sensor]
-        mask = interior(mask.shape, sensor) & ~sees_specular(problem.scene, sensor, partly=True)
-    derivative = adjoint(problem, initial, mask[:, :, None].astype(np.float32))
-    arrays = {"adjoints": derivative[None], **target_arrays(problem.views[:1])}
-    return Pictures(np.array(view.target), initial, arrays, shape)
-
-
-def sample(kind: Kind, count: int, config: Config, pictures: Pictures, series: str, limit: int | None = None) -> None:
-    """Take `count` gradients in a separate process. `limit` bounds the address space of the process in bytes.
-
-    Kinds with the same `series` have the same seeds.
-    """
-    first = {"config": dump(comparable(config, kind.by)), "source": str(config.source), "variant": VARIANT,
-             "memory_limit": limit, "allow_code": False, "quantity": "fixed", "purpose": series,
-             "arrays": pictures.arrays}  # fmt: skip
-    process, taken = start_process(first, "reslrb_cli.measure.steps:begin"), []
-    try:
-        process.answer(lambda: False)
-        for number in range(count):
-            process.ask({"numbers": [number], "spp": kind.spp, "image": 0, "cold": True, "release": False})
-            answer = process.answer(lambda: False)
-            kind.arrays_mib = max(kind.arrays_mib or 0.0, float(answer["peak_mib"]))
-            taken.append(answer["values"][0, : np.prod(pictures.shape)].reshape(pictures.shape))
-        kind.samples = np.stack(taken)
-    except Ended as end:
-        kind.end = end
-    finally:
-        process.close()
 
 
 def compare(pairs: Sequence[tuple[Kind, Kind]]) -> list[dict[str, Any]]:
@@ -188,32 +180,22 @@ def relative_noise(samples: np.ndarray, mean: np.ndarray) -> float:
 def fall(coarse: np.ndarray, fine: np.ndarray, expected: float) -> dict[str, Any]:
     """Return the ratio of the noise of (N, P) samples to the noise of (M, P) others, its interval, and a verdict.
 
-    The logarithm of the ratio has the jackknife's standard error, and the degrees of freedom of Welch and
-    Satterthwaite. A correct ratio lies outside of the test's interval with probability `ALPHA`. The verdict is `holds`
-    if the expected ratio lies in this interval. Instead of `holds`, the verdict is `unresolved` if the relative half
-    width of the interval exceeds `WIDEST`.
+    A correct ratio lies outside of the test's interval with probability `ALPHA`. The verdict is `holds` if the expected
+    ratio lies in this interval. Instead of `holds`, the verdict is `unresolved` if the relative half width of the
+    interval exceeds `WIDEST`.
     """
-    (a, var_a), (b, var_b) = (_log_deviation(samples) for samples in (coarse, fine))
-    error = np.sqrt(var_a + var_b)
-    freedom = error**4 / (var_a**2 / (len(coarse) - 1) + var_b**2 / (len(fine) - 1))
-    half, most = (stats.t.isf(level / 2, freedom) * error for level in (1 - CONFIDENCE, ALPHA))
-    verdict = Verdict.HOLDS if abs(a - b - np.log(expected)) <= most else Verdict.FAILS
+    logs = []
+    for samples in (coarse, fine):
+        (whole, without), count = squares_without(samples), len(samples)
+        logs.append(0.5 * np.log([whole / (count - 1), *(without / (count - 2))]))
+    found = jackknife(*logs)
+    found = replace(found, value=found.value - float(logs[1][0]))
+    most = -float(special().stdtrit(found.freedom, ALPHA / 2)) * found.error
+    verdict = Verdict.HOLDS if abs(found.value - np.log(expected)) <= most else Verdict.FAILS
     if verdict is Verdict.HOLDS and most > np.log1p(WIDEST):
         verdict = Verdict.UNRESOLVED
-    low, ratio, high = np.exp([a - b - half, a - b, a - b + half]).tolist()
-    return {"ratio": ratio, "low": low, "high": high, "expected": expected, "verdict": verdict}
-
-
-def _log_deviation(samples: np.ndarray) -> tuple[float, float]:
-    """Return the logarithm of the standard deviation of (N, P) samples, and the jackknife variance of this
-    logarithm.
-    """
-    count = len(samples)
-    deviations = np.square(samples - samples.mean(0)).sum(1)
-    total = deviations.sum()
-    # Leave-one-out: dropping row k lowers the sum of squares by n / (n - 1) times its squared distance.
-    left = 0.5 * np.log((total - deviations * count / (count - 1)) / (count - 2))
-    return float(0.5 * np.log(total / (count - 1))), float(jackknife_variance(left))
+    ratio = found.exponential()
+    return {"ratio": ratio.value, "low": ratio.low, "high": ratio.high, "expected": expected, "verdict": verdict}
 
 
 def colored(values: np.ndarray, end: float) -> np.ndarray:

@@ -21,10 +21,6 @@ from reslrb_cli.errors import ConfigError
 
 Row = Mapping[str, Any]
 IMAGES, PAGE, TEMPLATE = ROOT / "docs" / "images", ROOT / "docs" / "paper.md", PAPER / "page.md"
-#: Published for Figure 6, on an RTX 5080: milliseconds of a step by naive AD and by ResLRB, by depth.
-PUBLISHED_MS: dict[int, tuple[int | None, int | None]] = {4: (63, 93), 16: (260, 132), 128: (None, 197)}
-#: The depth at which both take the same time in the paper.
-PARITY = 8
 MEANS = "The next table compares the means of the gradients in standard errors."
 
 
@@ -74,43 +70,15 @@ def _figure5(record: Row) -> str:
 
 
 def _figure6(lines: Sequence[Row]) -> str:
-    rows = [line for line in lines if line.get("kind") != "origin"]
-    depths = sorted({row["max_depth"] for row in rows})
-    found = {(tables.name_of(row), row["max_depth"]): row for row in rows}
-    names = list(dict.fromkeys(name for name, _ in found))
-
-    def published(depth: int, number: int) -> str:
-        value = PUBLISHED_MS.get(depth, (None, None))[number]
-        return "" if value is None else f"{value} ms"
-
-    def ratio(depth: int) -> str:
-        naive, ours = PUBLISHED_MS.get(depth, (None, None))
-        return "about 1" if depth == PARITY else "" if naive is None or ours is None else f"{ours / naive:.2f}"
-
-    def measured(name: str, depth: int) -> str:
-        row = found.get((name, depth))
-        if row is None or row["status"] != "ok":
-            return "" if row is None else str(row["status"]).replace("_", " ")
-        return f"{row['step_ms']['median']:.0f} ms, {row['peak_mib']:.0f}"
-
-    def over(name: str, depth: int) -> str:
-        row, base = found.get((name, depth)), found.get((names[0], depth))
-        return tables.ratio(row, base, "step_ms") if row and row["status"] == "ok" else ""
-
-    cells = [[f"published, {name}", *(published(depth, number) for depth in depths)]
-             for number, name in enumerate(("naive AD", "ResLRB"))]  # fmt: skip
-    cells += [[name, *(measured(name, depth) for depth in depths)] for name in names]
-    ratios = [["published", *map(ratio, depths)]]
-    ratios += [[name, *(over(name, depth) for depth in depths)] for name in names[1:]]
-    head, film = ["depth", *map(str, depths)], "{width}x{height} pixels with {spp} samples each".format_map(rows[0])
-    origins = dict.fromkeys(_origin(line) for line in lines if line.get("kind") == "origin")
+    [origin], rows = ([row for row in lines if (row.get("kind") == "origin") is wanted] for wanted in (True, False))
+    film = "{width}x{height} pixels with {spp} samples each".format_map(rows[0])
     about = (
-        f"The table shows the milliseconds of a step, and the peak of the arrays in MiB. The film has {film}.\n"
-        "The steps use no Russian roulette."
+        f"The film has {film}, and the steps use no Russian roulette. The first table has\n"
+        "the time of a step, divided by that of naive AD (`ptracer`)."
     )
-    over_naive = f"The next table shows the time of a step, divided by a step of naive AD ({names[0]})."
-    parts = [about, tables.table(head, cells), over_naive, tables.table(head, ratios)]
-    return "\n\n".join([*origins, *parts])
+    made = tables.Record(origin, rows)
+    ratios = tables.bench_ratios(made, "depth", "step_ms")
+    return "\n\n".join([_origin(origin), about, ratios, tables.bench_details(made, "depth")])
 
 
 #: What a figure says, by its record.

@@ -102,9 +102,9 @@ def figure(value: float | None, digits: int = 3) -> str:
     return f"{value:.0f}" if "e+" in whole and abs(value) < 1e6 else whole
 
 
-def bench_ratios(record: Record, swept: str) -> str:
-    """Return a table of kernel times divided by those of `ptracer`. The table has a column for each value of the sweep,
-    and a column with the range of the peaks.
+def bench_ratios(record: Record, swept: str, times: str = "kernel_ms") -> str:
+    """Return a table of kernel times, or of other `times`, divided by those of `ptracer`. The table has a column for
+    each value of the sweep, and a column with the range of the peaks.
     """
     key, head = SWEPT[swept]
     values = sorted({row[key] for row in record.rows})
@@ -116,7 +116,7 @@ def bench_ratios(record: Record, swept: str) -> str:
     for name, of in found.items():
         peaks = sorted(row["peak_mib"] for row in of.values() if row["status"] == "ok")
         ends = " to ".join(dict.fromkeys(f"{peak:.1f}" for peak in (*peaks[:1], *peaks[-1:])))
-        lines.append([name, *(ratio(of.get(value), base.get(value), "kernel_ms") for value in values), ends])
+        lines.append([name, *(ratio(of.get(value), base.get(value), times) for value in values), ends])
     return table([head, *map(str, values), "peak memory, MiB"], lines)
 
 

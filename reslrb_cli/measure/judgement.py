@@ -154,7 +154,7 @@ class MethodSamples:
         other = (squares.mean() + moved - reference.noises) * reference.signal / reference.signals
         # the delta method, because leaving out a row may lower an error below 0
         value = np.log(squared / reference.signal) - 1
-        found = _jackknife(value + own / squared, value + other / squared).exponential()
+        found = jackknife(value + own / squared, value + other / squared).exponential()
         return float(np.sqrt(found.low)), float(np.sqrt(found.high))
 
     def slope(self) -> float | None:
@@ -197,7 +197,7 @@ class MethodSamples:
         other = np.maximum(other, 0.0) + variances[0]
         if min(own.min(), other.min(), reference.signals.min()) <= 0:
             return None
-        return _jackknife(np.log(reference.signal / own / seconds), np.log(reference.signals / other / self.step_s))
+        return jackknife(np.log(reference.signal / own / seconds), np.log(reference.signals / other / self.step_s))
 
     def seconds_to(self, error: float, biased: bool) -> tuple[float | None, bool]:
         """Return the seconds until the relative error is `error`. Also return a boolean that is true if the seconds are
@@ -215,7 +215,7 @@ class MethodSamples:
         return steps * self.step_s, bool(steps > self.count or floor is None or error < floor)
 
 
-def _jackknife(own: np.ndarray, other: np.ndarray) -> JackknifeEstimate:
+def jackknife(own: np.ndarray, other: np.ndarray) -> JackknifeEstimate:
     """Return an estimate with the jackknife variances of the samples and of the reference. Welch and Satterthwaite's
     rule combines the two variances.
 

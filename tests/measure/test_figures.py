@@ -12,7 +12,7 @@ from make_figures import write_panels
 
 from paper import figure1, figure5
 from paper.figures import main
-from paper.gradients import OWN, Kind, comparable, fall, relative_noise, sample, take_pictures
+from paper.gradients import OWN, Kind, Sampling, comparable, fall, relative_noise
 from paper.page import FIGURES
 from reslrb_cli.config.loader import load
 from reslrb_cli.config.schema import Config
@@ -135,12 +135,10 @@ def test_compared_methods_have_one_expectation(config: Config) -> None:
     """The comparison disables every part of our method that naive AD lacks."""
     y, x = np.mgrid[0:16, 0:16] / 16
     adjoint = np.repeat((np.sin(5 * x) * np.cos(4 * y) + 1.5)[:, :, None], 3, 2).astype(np.float32)
-    kinds, pictures = [Kind(by, 64, by) for by in (OWN, "ptracer")], take_pictures(config, 16)
-    pictures.arrays["adjoints"] = adjoint[None]
-    for kind in kinds:
-        sample(kind, 16, config, pictures, kind.by)
-        assert kind.samples is not None
-        assert kind.samples.shape == (16, 8, 8, 1)
+    made = Sampling(config, 16, print)
+    made.arrays["adjoints"] = adjoint[None]
+    kinds = [made.take(Kind(by, 64, by), 16, by) for by in (OWN, "ptracer")]
+    assert [np.shape(kind.samples) for kind in kinds] == [(16, 8, 8, 1)] * 2
     ours, naive = (kind.rows for kind in kinds)
     family = Family(1, entry_count((8, 8, 1)))
     figures = compare_expectations(ours, naive, family, shape=(8, 8, 1), paired=False)
@@ -152,9 +150,8 @@ def test_a_process_ends_at_its_limit() -> None:
     """The process loads the scene, but its memory limit is too small for the paths that naive AD stores at this sample
     count.
     """
-    kind = Kind("naive AD", 2**16, "ptracer")
-    config = load(figure1.CONFIG, SMALL)
-    sample(kind, 1, config, take_pictures(config, 16), "test", 3 << 29)
+    made = Sampling(load(figure1.CONFIG, SMALL), 16, print, limit=3 << 29)
+    kind = made.take(Kind("naive AD", 2**16, "ptracer"), 1, "test", may_end=True)
     assert kind.end is not None
     assert kind.end.status is BenchStatus.OUT_OF_MEMORY
     assert kind.samples is None
