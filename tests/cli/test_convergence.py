@@ -74,26 +74,6 @@ def test_a_too_small_budget_is_reported(folder: Path) -> None:
     assert "dL/dI was not computed: the budget was spent; allow more with --budget" in out
 
 
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (("--integrators", "reslrb:stack(adjoint=batched)"), "adjoint: has no effect if dL/dI is known"),
-        (("--reference", "ptracer,prb"), "--reference: errors are relative to one method; name one"),
-        (("--reference", "walk"), "--reference walk: integrator.type: must be one of"),
-        (("--json", "no/such/folder.jsonl"), "--json: cannot write no/such/folder.jsonl"),
-        (("--objective", "gradient"), "'gradient' is not one of 'fixed', 'loss', 'image'"),
-        (("--spp", "4,0"), "0 is not in the range"),
-        (("--spp", "4,4"), "`4,4` has a number twice"),
-        (("--spp", "3", "--set", "integrator.samples_per_pass=2"), "integrator.samples_per_pass: 2 does not divide"),
-        (("--integrators", "reslrb:auto"), "`auto` is for whole runs; use `stack`"),
-    ],
-)
-def test_bad_input_is_one_located_line(folder: Path, args: tuple[str, ...], line: str) -> None:
-    code, out, err = outcome("convergence", "tiny.yaml", *args)
-    assert (code, out, len(err.splitlines())) == (2, "", 1)
-    assert line in err
-
-
 @pytest.mark.long
 def test_the_image(folder: Path) -> None:
     words = ("--objective", "image", "--rounds", "4", "--json", "c.jsonl", "--integrators", "prb")

@@ -104,39 +104,6 @@ def test_an_internal_error_keeps_its_traceback() -> None:
 
 
 @pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        ([], "reslrb: Missing command"),
-        (["optimise"], "reslrb: No such command 'optimise'; did you mean `optimize`?"),
-        (["inspekt", "a.yaml"], "reslrb: No such command 'inspekt'; did you mean `inspect`?"),
-        (["frobnicate"], "reslrb: No such command 'frobnicate'. See"),
-        (["--nope"], "reslrb: No such option"),
-        (["doctor", "--nope"], "reslrb doctor: No such option"),
-        (["optimize"], "reslrb optimize: Missing argument 'CONFIG'"),
-        (["optimize", "a.yaml", "--resume", "r"], "reslrb optimize: --resume RUN uses the configuration of the run"),
-        (["optimize", "--resume", "r", "--dry-run"], "reslrb optimize: --dry-run is for a new run, --resume continues"),
-        (["optimize", "a.yaml", "--dry-run", "--cluster", "local:2"], "reslrb optimize: --dry-run measures only this"),
-        (["report", *["gone"] * 100], "gone: no such file or folder"),
-        (["report", *["gone"] * 101], "RUN: 101 are given; a page shows at most 100"),
-        (["sweep"], "reslrb sweep: Missing argument 'CONFIG'"),
-        (["sweep", "a.yaml", "--resume", "s"], "reslrb sweep: --resume continues a sweep with its own settings"),
-        (["sweep", "--resume", "s"], "s: no such file or folder; start a sweep by `reslrb sweep CONFIG --vary"),
-        (
-            ["bench", "--sweep", "spp", "--max-depth", "3"],
-            "--max-depth: needs --sweep depth; use --set integrator.max_depth=3",
-        ),
-        (["bench", "--sweep", "depth", "--values", "3", "--max-depth", "3"], "--max-depth: has no effect with --val"),
-        (["render", "a.yaml", "--exposure", "bright"], "reslrb render: Invalid value for '--exposure': 'bright' is"),
-        (["render", "a.yaml", "--exposure", "0"], "reslrb render: Invalid value for '--exposure': '0' is neither"),
-    ],
-)
-def test_usage_errors_are_one_line(args: list[str], line: str) -> None:
-    code, _, err = tiny.outcome(*args)
-    assert (code, len(err.strip().splitlines())) == (ExitCode.USAGE, 1)
-    assert err.startswith(line)
-
-
-@pytest.mark.parametrize(
     ("interrupted", "done", "states", "code"),
     [
         (True, True, {BenchStatus.OK}, ExitCode.INTERRUPTED),

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -239,23 +237,6 @@ def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:
     assert "exported exists" in again.output
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("runs/tiny", "--scene"), "remove --initial or --scene"),
-        (("runs",), "has no manifest.json"),
-    ],
-)
-def test_other_folders_are_refused(
-    folder: Path, arguments: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    result = reslrb("render", *arguments, "-o", "x.exr")
-    assert result.exit_code == 2
-    assert message in result.output
-    assert not (folder / "x.exr").exists()
-
-
 def test_missing_or_bad_values_of_a_run_are_refused_in_one_line(folder: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     (run / "checkpoint").mkdir(parents=True)
@@ -351,29 +332,9 @@ def test_one_view_keeps_its_lamps(
     assert (found.target.exposure, found.run.held_out, found.run.views_per_iteration) == (1.0, [], None)
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("a.exr", None),
-        ("A.PNG", None),
-        ("here/a.jpeg", None),
-        ("a.gif", "a.gif has no known image format; use .exr"),
-        ("exr", "exr has no known image format"),
-        ("folder.exr", "folder.exr is a folder, or in a folder that does not exist"),
-        ("nowhere/a.exr", "nowhere/a.exr is a folder, or in a folder that does not exist"),
-        ("pipe.exr", "pipe.exr is not a regular file"),
-    ],
-)
-def test_the_file_of_an_image_is_checked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, message: str | None
-) -> None:
+@pytest.mark.parametrize("name", ["a.exr", "A.PNG", "here/a.jpeg"])
+def test_the_file_of_an_image_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.chdir(tmp_path)
-    for folder in ("here", "folder.exr"):
-        Path(folder).mkdir()
-    os.mkfifo("pipe.exr")
-    if message is None:
-        check_image_path(Path(name))
-        assert not Path(name).exists()
-    else:
-        with pytest.raises(ConfigError, match=re.escape(f"--output: {message}")):
-            check_image_path(Path(name))
+    Path("here").mkdir()
+    check_image_path(Path(name))
+    assert not Path(name).exists()

@@ -75,34 +75,6 @@ def test_failures_are_named(
     assert re.fullmatch(where + r"relative L2 0\.\d+, limit 0\.0001", lines[2])
 
 
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (["--integrators", "reslrb:stak"], "--integrators reslrb:stak: integrator.estimator: must be one of"),
-        (["--integrators", "reslrb:stack("], "--integrators: `reslrb:stack(` is not an integrator"),
-        (["--integrators", "prb"], "--integrators: `prb` is neither an estimator, reslrb:ESTIMATOR, nor your own"),
-        (["--set", "run.sp=3"], "did you mean `spp`?"),
-        (["--seeds", "2"], "--seeds"),
-        (["--json", "/nowhere/a.jsonl"], "--json: cannot write /nowhere/a.jsonl"),
-        (["nothing.yaml"], "nothing.yaml: no such file"),
-        (["--missing"], "--missing: needs a CONFIG with parameters and a loss"),
-        (["--missing", "--draws", "a.npz"], "--draws: has no effect with --missing"),
-        (["--suite", "extreme", "--set", "run.spp=4"], "--suite: --set has no effect on a suite, except for variant"),
-        (["--suite", "extreme", "--draws", "a.npz"], "--suite: --draws has no effect on a suite"),
-        (["--suite", "extrem"], "--suite: there is no suite `extrem`; write extreme, or extreme:CASE"),
-        (["--suite", "extreme", "a.yaml"], "--suite: CONFIG has no effect on a suite"),
-        (["--suite", "extreme", "--spp", "4"], "--suite: --spp has no effect on a suite"),
-        (["--suite", "extreme", "--integrators", "reslrb:stak"], "`stak` is no estimator; there are reservoir"),
-        (["--suite", "extreme", "--integrators", "own.py:A"], "a suite allows estimators of reslrb, and no option"),
-        (["--suite", "extreme", "--integrators", "reslrb:event(capacity=2)"], "and no option except paths"),
-    ],
-)
-def test_wrong_calls_are_one_located_line(args: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(*args) == 2
-    [error] = capsys.readouterr().err.strip().splitlines()
-    assert line in error
-
-
 @pytest.mark.long
 def test_a_case_of_the_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     json_file = tmp_path / "a.jsonl"

@@ -180,26 +180,6 @@ def test_an_8_bit_texture_is_offered_recovered_and_exported(folder: Path) -> Non
     assert scene.read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("room/scene.xml", "--target", "wide.png"), "is 16x8 pixels, the scene's film 8x8, with another aspect ratio"),
-        (("room/scene.xml", "--target", "wide.png"), "such as 8x8"),
-        (("room/scene.xml", "--target", "none.png"), "none.png: no such file"),
-        (("room/scene.xml", "--target", "room/scene.xml"), "is not a readable image"),
-        (("room/none.xml",), "none.xml: no such file"),
-        (("room/scene.xml", "-o", "config.txt"), "must end in .yaml"),
-        (("room/scene.xml", "-o", "nowhere/config.yaml"), "cannot write"),
-    ],
-)
-def test_errors_are_one_line(folder: Path, arguments: tuple[str, ...], message: str) -> None:
-    write_noise(folder / "wide.png", 16, 8)
-    result = reslrb("init", *arguments)
-    assert result.exit_code == 2
-    assert message in result.output
-    assert {path.name for path in folder.iterdir()} == {"room", "wide.png"}
-
-
 #: A floor with its own texture that fills most of the image, a ball, an object that is not seen, and parameters without
 #: effect.
 VIEW = """<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" value="16"/>

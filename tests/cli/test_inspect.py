@@ -160,28 +160,6 @@ def test_an_incomplete_configuration_is_accepted(scene, text, next_step):
     assert ("can be recovered: 8 (* in `parameters`)" in found) is has_parameters
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["none.xml"], "none.xml: no such file"),
-        (["none.yaml"], "none.yaml: no such file"),
-        (["."], ".: is a folder without a run"),
-        (
-            ["scene.xml", "--set", "scene.options.nothing=1"],
-            "$nothing: is set in scene.options, but the scene file does",
-        ),
-        (["scene.xml", "--set", "scene.filee=1"], "--set scene.filee=1: scene.filee: unknown key"),
-        (["empty.yaml"], "empty.yaml: is empty; it needs at least scene"),
-        (["run.yaml"], "run.yaml: scene: missing; it has no default"),
-    ],
-)
-def test_wrong_arguments(scene, arguments, said):
-    Path("empty.yaml").write_text("")
-    Path("run.yaml").write_text("run: {spp: 4}")
-    code, _, err = outcome("inspect", *arguments)
-    assert (code, said in err.splitlines()[-1]) == (2, True)
-
-
 def test_a_run_folder_shows_its_progress(scene):
     Path("c.yaml").write_text(
         "scene: {file: scene.xml}\ntarget: {render: {spp: 4}}\nparameters: [{key: Sphere_1.emitter.radiance.value}]\n"

@@ -55,34 +55,6 @@ def test_the_page_of_one_run_is_rewritten(tmp_path, monkeypatch):
     assert "refresh" not in (folder / "report.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (["gone"], "gone: no such file"),
-        (["a", "note.txt"], "note.txt: line 1: is damaged, or no line that reslrb wrote"),
-        (["empty"], "empty: is no run folder"),
-        (["a", "a"], "--output: is missing"),
-        (["a", "-o", "gone/page.html"], "--output: cannot write gone/page.html"),
-        (["a"] * 101, "RUN: 101 are given; a page shows at most 100"),
-        (["pipe"], "pipe: is a pipe, a socket or a device, not a regular file"),
-        (["\x1b[31m"], "\\x1b[31m: no such file"),
-    ],
-)
-def test_errors_are_one_line(tmp_path, monkeypatch, args, line):
-    monkeypatch.chdir(tmp_path)
-    make_run(tmp_path / "a", iterations=0)
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "note.txt").write_text("hello\n")
-    os.mkfifo(tmp_path / "pipe")
-    write_bench(tmp_path / "bench.jsonl")
-    before = sorted(tmp_path.rglob("*"))
-    code, out, err = outcome("report", *args)
-    assert (code, out) == (2, "")
-    assert err.startswith(line)
-    assert err.count("\n") == 1
-    assert sorted(tmp_path.rglob("*")) == before
-
-
 # The page of a run in progress. The page is current and always complete, and writing it is not counted as run time.
 
 RUN, PAGE = Path("runs/tiny"), Path("runs/tiny/report.html")

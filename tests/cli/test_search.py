@@ -196,40 +196,6 @@ def test_the_loss_counts_if_true_values_are_unknown(folder, monkeypatch):
     assert "--search: losses of different `loss.type` are not of the same" in result.output
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["--vary", f"{SPP}={{low: 2, high: 4}}"], "a range needs --search, as in --search optuna --trials 20"),
-        (["--search", "optuna"], "a search needs both --search optuna and --trials N"),
-        (["--trials", "3"], "a search needs both --search optuna and --trials N"),
-        (["--search", "optuna", "--trials", "3"], "--search: needs settings to choose, such as --vary"),
-        (["--search", "grid", "--trials", "3"], "'grid' is not 'optuna'"),
-        (["@", f"{RATE}={{low: 0, high: 1, log: true}}"], "a low end below the high end, and above 0 with log: true"),
-        (["@", f"{RATE}={{low: 1, high: 1}}"], "must have a low end below the high end"),
-        (["@", f"{RATE}={{low: 0.1, hi: 1}}"], "or a range such as {low: 0.01, high: 0.3, log: true}"),
-        (["@", f"{RATE}={{low: 0.1, high: x}}"], "or a range such as"),
-        (["@", f"{RATE}={{low: 0.1, high: 1, log: 1}}"], "or a range such as"),
-        (["@", "optimizer.type=[adam, sdg, sgd]"], "--vary optimizer.type=sdg: optimizer.type: "),
-        (["@", f"{RATE}=0.1"], f"must be a list of values, such as {RATE}=[16, 32], or a range such as {RATE}={{low"),
-        (["@", f"{SPP}={{low: 0.5, high: 4}}"], f"--vary {SPP}=0.5: run.spp: must be an integer"),
-        (["@", f"{SPP}={{low: -1, high: 4}}"], f"--vary {SPP}=-1: run.spp: must be"),
-        (["@", f"{RATE}={{low: 0.1, high: 1}}", "--seeds", "400"], "--trials: 3 x 400 seeds are 1200 runs"),
-        (
-            ["@", "loss.type=[l1, l2]", "--set", "target={file: a.png}"],
-            "losses of different `loss.type` are not of the",
-        ),
-    ],
-)
-def test_errors_are_reported_before_any_run(folder, arguments, line):
-    tiny.write_photo(folder / "a.png", np.full((8, 8, 3), 0.5))
-    if arguments[0] == "@":
-        arguments = ["--search", "optuna", "--trials", "3", "--vary", *arguments[1:]]
-    result = reslrb("sweep", "tiny.yaml", "-o", "s", *arguments)
-    assert result.exit_code == 2
-    assert line in result.output
-    assert not Path("s").exists()
-
-
 def test_the_commands_of_the_docs_run(folder):
     page = (tiny.ROOT / "docs/sweeps.md").read_text(encoding="utf-8")
     block = page[page.index("## Search") : page.index("`--search optuna` looks")].replace("room.yaml", "tiny.yaml")

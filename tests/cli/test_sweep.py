@@ -149,43 +149,6 @@ def test_names_are_short_safe_and_different(folder):
         assert not name.startswith(".")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["--vary", "run.spp"], "--vary run.spp: must be KEY=[VALUE, ...], such as run.spp=[16, 32]"),
-        (["--vary", "run.spp=4"], "--vary run.spp=4: must be a list of values, such as run.spp=[16, 32]"),
-        (["--vary", "run.spp=[4, 4]"], "--vary run.spp=[4, 4]: has 4 twice"),
-        (["--vary", "run.spq=[4, 8]"], "--vary run.spq=4: run.spq: unknown key; did you mean `spp`"),
-        (["--vary", "run.spp=[4, {}]"], "--vary run.spp={}: run.spp: must be"),
-        (["--vary", "run.spp=[4", "--seeds", "2"], "--vary run.spp=[4: not valid YAML"),
-        (["--vary", "run.seed=[1, 2]"], "--vary run.seed=[1, 2]: cannot be varied: use --seeds N"),
-        (["--vary", "run=[{spp: 4}, {seed: 3}]"], "--vary: run.seed: is 3, but 0 in the first combination"),
-        (["--vary", "run.spp=[4]", "--vary", "run=[{spp: 4}]"], "--vary run: replaces what --vary run.spp sets"),
-        (["--vary", "run.spp=[4, 8]", "--seeds", "501"], "2 x 501 seeds are 1002 runs; a sweep has at most 1000"),
-        (["--set", f"run.seed={2**32 - 1}", "--seeds", "2"], "--seeds: exceeds the last seed, 4294967295"),
-        # Each value is valid with some of the others, but not every combination is valid
-        (["--vary", "run.spp=[4, 6]", "--vary", "run.adjoint=[independent, batched]"], "run.adjoint"),
-        (["--set", "scene.file=gone.xml", "--vary", "run.spp=[4]"], "gone.xml: no such file"),
-        (["--vary", "integrator=[prb, path]"], "--vary integrator path: integrator.type: must be one of"),
-        (["--vary", "integrator=[prb, 'ptracer,prb']"], "names several integrators in one value"),
-        (["--vary", "integrator=[prb, 'reslrb:']"], "--vary integrator: `reslrb:` is not an integrator; write TYPE"),
-        (["--vary", "integrator=[own.py:Own]"], "would run with all your rights; --allow-code permits it"),
-        (["--resume", "."], ".: is no sweep's folder: it has no sweep.json"),
-        (["-o", "tiny.yaml"], "Directory 'tiny.yaml' is a file"),
-        (["-o", "."], ", but no sweep; give a new or empty folder"),
-        (["-o", "tiny.yaml/s"], "-o: cannot write to tiny.yaml/s (Not a directory); give another folder"),
-    ],
-)  # fmt: skip
-def test_errors_are_reported_before_any_run(folder, arguments, line):
-    before = tiny.files(folder)
-    config = [] if "--resume" in arguments else ["tiny.yaml"]
-    result = reslrb("sweep", *config, *arguments)
-    assert result.exit_code == 2
-    assert line in result.output
-    assert len(result.output.strip().splitlines()) == 1
-    assert tiny.files(folder) == before
-
-
 def test_a_folder_has_one_sweep(folder):
     arguments = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "run.iterations=[1]", "-o", "s"]
     Path("s/configs").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Golden values: the exact bits of three iterations of each run in `RUNS`, and the output of commands.
+"""Golden values: the exact bits of three iterations of each run in `RUNS`, and the output of commands and functions.
 
 The golden values protect changes that must not change any result, for example merged, moved or renamed files. Run as a
 program, this file rewrites `values.json` in the same folder for this processor and libLLVM. On another machine, run it
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 import subprocess
@@ -23,6 +24,10 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 VALUES = Path(__file__).with_name("values.json")
+#: Values of `check`, and the environment variable that makes `check` store them, if its value is `write`.
+SAID, WRITE = Path(__file__).with_name("said.json"), "RESLRB_GOLDEN"
+#: A number with decimals or an exponent. Such numbers may differ by a hundredth, which covers rounding in print.
+_DECIMAL = re.compile(r"(-?\d+\.\d+(?:e[-+]\d+)?|-?\d+e[-+]\d+)")
 SCHEMA = ROOT / "docs" / "config.schema.json"
 #: The smallest settings that still exercise every part of a run. Plain gradient descent hides no bit of the gradients.
 SMALL = (
@@ -198,6 +203,35 @@ def form_of(name: str) -> list[str]:
             [json.loads(text)] if whole else [json.loads(line) for line in text.splitlines() if line.startswith("{")]
         )
     return sorted({json.dumps(form(line), sort_keys=True) for line in lines})
+
+
+def check(name: str, found: Any) -> None:
+    """Compare a text, or a value for JSON, with the stored one of this `name`. Decimals may differ by a hundredth."""
+    found = json.loads(json.dumps(found.splitlines() if isinstance(found, str) else found, default=str))
+    content = json.loads(SAID.read_text())
+    if os.environ.get(WRITE) == "write":
+        content[name] = found
+        SAID.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+    known = content.get(name)
+    assert _rounded(found, known) == known, f"{name} has changed; if intended, run the test with {WRITE}=write"
+
+
+def _rounded(found: Any, known: Any) -> Any:
+    """Return `found` with the decimals of `known` in place of those that differ by less than a hundredth."""
+    if isinstance(found, dict) and isinstance(known, dict):
+        return {key: _rounded(value, known.get(key)) for key, value in found.items()}
+    if isinstance(found, list) and isinstance(known, list):
+        return [_rounded(*pair) for pair in zip(found, known, strict=False)] + found[len(known) :]
+    if isinstance(found, str) and isinstance(known, str):
+        parts, others = _DECIMAL.split(found), _DECIMAL.split(known)
+        if parts[::2] == others[::2]:
+            return "".join(
+                other if place % 2 and math.isclose(float(part), float(other), rel_tol=0.01) else part
+                for place, (part, other) in enumerate(zip(parts, others, strict=True))
+            )
+    if isinstance(found, float) and isinstance(known, (int, float)) and math.isclose(found, known, rel_tol=0.01):
+        return known
+    return found
 
 
 def texts() -> dict[str, str]:
