@@ -48,6 +48,9 @@ COMPARING = {"suite": "--suite", "integrators": "--integrators", "draws": "--dra
 #: Options of a configuration; a suite has none but the variant.
 CONFIGURED = {"config_file": "CONFIG", "budget": "--budget", "spp": "--spp", "draws": "--draws"}
 
+#: The suites: all cases of the catalogue, and those of each tag.
+SUITES = ("extreme", "colours", "lights", "places", "roughness", "films", "glass", "losses", "motion", "unfound")
+
 
 @dataclass(frozen=True)
 class GradcheckOptions(ExperimentOptions):
@@ -72,8 +75,8 @@ class GradcheckOptions(ExperimentOptions):
             raise ConfigError("--suite", "", f"{option} has no effect on a suite; remove it")
         if self.suite is not None and any(not text.startswith("variant=") for text in self.overrides):
             raise ConfigError("--suite", "", "--set has no effect on a suite, except for variant; remove it")
-        if self.suite is not None and self.suite.partition(":")[0] != "extreme":
-            raise ConfigError("--suite", "", f"there is no suite `{self.suite}`; write extreme, or extreme:CASE")
+        if self.suite is not None and self.suite.partition(":")[0] not in SUITES:
+            raise ConfigError("--suite", "", f"there is no suite `{self.suite}`; there are {', '.join(SUITES)}")
 
 
 def _given(options: dict[str, str]) -> str | None:
@@ -111,25 +114,27 @@ def run_missing(options: GradcheckOptions, config: Config, variant: str) -> int:
 
 
 def run_suite(options: GradcheckOptions) -> int:
-    """Run the named cases, or all cases without names. Print a line for each case and write the file."""
+    """Run the named cases, or all cases of the suite without names. Print a line for each case and write the file."""
     chosen = None if options.integrators is None else _estimators(options.integrators)
     variant = set_variant(options.config().variant)
 
     import mitsuba as mi
 
     from reslrb_cli.measure.extreme import CASES, case_records
+    from reslrb_cli.measure.scenes.catalogue import TAGGED
     from reslrb_cli.report.tables import summary_lines
 
-    listed = str(options.suite).partition(":")[2]
-    names = [name.strip() for name in listed.split(",")] if listed else []
+    suite, _, listed = str(options.suite).partition(":")
+    cases = [*CASES] if suite == "extreme" else [case.name for case in TAGGED[suite]]
+    names = [name.strip() for name in listed.split(",")] if listed else cases
     for name in names:
-        if name not in CASES:
-            raise ConfigError("--suite", "", f"there is no case `{name}`; {did_you_mean(name, CASES, cutoff=0)}")
+        if name not in cases:
+            raise ConfigError("--suite", "", f"there is no case `{name}`; {did_you_mean(name, cases, cutoff=0)}")
     echo(f"{device_name(variant)}, {variant}")
     records: list[GradcheckRecord] = []
     keeper = Keeper(options.json_file, origin_of(variant), lambda: records)
     with Interrupts() as interrupts:
-        for name in names or CASES:
+        for name in names:
             if mi.is_spectral and (reason := CASES[name].not_spectral):
                 echo(f"{name:40s}  left out: {reason}")
                 continue
@@ -175,9 +180,9 @@ def _case_line(case: str, rows: list[GradcheckRecord]) -> str:
 
 @click.command("gradcheck")
 @optional_experiment_arguments
-@click.option("--suite", metavar="extreme[:CASE,...]",
-              help="Run the scenes of a suite in place of CONFIG, or only the named cases. extreme: scenes in which "
-                   "gradients often fail.")  # fmt: skip
+@click.option("--suite", metavar="extreme|TAG[:CASE,...]",
+              help="Run scenes in which gradients often fail in place of CONFIG: all, those of a tag such as glass or "
+                   "motion, or only the named cases.")  # fmt: skip
 @click.option("--integrators", metavar="LIST",
               help=
         "Check these, separated by commas: estimators, reslrb:ESTIMATOR[(OPTION=VALUE,...)], or your own Mitsuba "

@@ -321,26 +321,19 @@ def compare_expectations(
     judged = ~counts if heavy or few else np.ones_like(counts)
     our_mean, its_mean = ours.mean(0), np.atleast_2d(reference).mean(0)
     far = _ratio(np.linalg.norm(our_mean - its_mean), np.linalg.norm(its_mean))
-    cosine, variances = _alikeness(ours, reference)
     verdict, message = Verdict.HOLDS, ""
     if not np.all(np.abs(z[judged]) < family.z_max_limit) or (judged.all() and not z_rms < rms_limit):
         verdict = Verdict.FAILS
     elif heavy:
-        verdict, message = (
-            Verdict.HEAVY_TAILED,
-            ("single seeds dominate the variance: use more samples per pixel, or more seeds"),
-        )
-    elif few:
-        message = f"{len(ours)} seeds are too few to know the noise: use at least {TAIL_SEEDS}"
-        verdict = Verdict.UNRESOLVED
-    elif detectable > RESOLUTION:
-        verdict, message = (
-            Verdict.UNRESOLVED,
-            (f"a deviation of {detectable:.0%} could hide in the noise: use more seeds"),
-        )
+        verdict = Verdict.HEAVY_TAILED
+        message = "single seeds dominate the variance: use more samples per pixel, or more seeds"
+    elif few or detectable > RESOLUTION:
+        verdict, message = Verdict.UNRESOLVED, f"a deviation of {detectable:.0%} could hide in the noise"
+        message = f"{len(ours)} seeds are too few to know the noise" if few else message
+        message += f": use at least {TAIL_SEEDS}" if few else ": use more seeds"
     return Comparison(
         verdict, relative_l2=far, z_rms=z_rms, z_rms_limit=rms_limit, z_max=z_max, z_max_limit=family.z_max_limit,
-        cosine=cosine, variance_ratio=variances, detectable=detectable, message=message,
+        detectable=detectable, message=message, **_alikeness(ours, reference),
     )  # fmt: skip
 
 
@@ -359,27 +352,22 @@ def compare_equal_seeds(ours: np.ndarray, reference: np.ndarray, limit: float = 
     sizes, differences = np.linalg.norm(reference, axis=0), np.linalg.norm(ours - reference, axis=0)
     with np.errstate(over="ignore"):
         own = differences / np.maximum(sizes, max(NEGLIGIBLE * sizes.max(), np.finfo(float).tiny))
-    cosine, variances = _alikeness(ours, reference)
     verdict, message = Verdict.HOLDS if distance < limit else Verdict.FAILS, ""
     if verdict is Verdict.HOLDS and not np.mean(np.square(own)) < limit:
         wrong = np.count_nonzero(own > np.sqrt(limit))
         message = f"{wrong} of {own.size} entries differ by up to {own.max():.2g} times their own size"
         verdict = Verdict.FAILS
     return Comparison(
-        verdict, distance, relative_l2_limit=limit, cosine=cosine, variance_ratio=variances, detectable=limit,
-        message=message,
-    )  # fmt: skip
+        verdict, distance, relative_l2_limit=limit, detectable=limit, message=message, **_alikeness(ours, reference)
+    )
 
 
-def _alikeness(ours: np.ndarray, reference: np.ndarray) -> tuple[float | None, float | None]:
-    """Return the cosine of the angle between the means, and the ratio of the summed variances. A value of 0 / 0 is
-    None.
-    """
+def _alikeness(ours: np.ndarray, reference: np.ndarray) -> dict[str, float | None]:
+    """Return the cosine of the angle between the means, and the ratio of the summed variances, or None for 0 / 0."""
     a, b = ours.mean(0), np.atleast_2d(reference).mean(0)
-    cosine = _ratio(a @ b, np.linalg.norm(a) * np.linalg.norm(b)) if a.size > 1 else None
-    if reference.ndim == 1 or len(ours) < 2:
-        return cosine, None
-    return cosine, _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum())
+    cosine, varies = _ratio(a @ b, np.linalg.norm(a) * np.linalg.norm(b)), reference.ndim > 1 and len(ours) > 1
+    ratio = _ratio(ours.var(0, ddof=1).sum(), reference.var(0, ddof=1).sum()) if varies else None
+    return {"cosine": cosine if a.size > 1 else None, "variance_ratio": ratio}
 
 
 def tail_weight(samples: np.ndarray) -> float:

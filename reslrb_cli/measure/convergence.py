@@ -96,22 +96,16 @@ class Session(Engine):
         self.facts, self._arrays = stored.facts, stored.arrays
         return True
 
-    def _why_not(self, case: NamedIntegrator) -> str | None:
-        """Return why a method of the default list is left out, or None if it takes part."""
-        if not self.plan.default:
-            return None
-        if self.facts["paths"] == "light" and case.options.get("paths", "light") != "light":
-            return "this scene has only light paths"
-        reason: str | None = self.facts["without"].get(case.type)
-        return reason
-
     def _add_members(self) -> None:
         plan, facts = self.plan, self.facts
-        left_out = {case.label: reason for case in plan.cases if (reason := self._why_not(case)) is not None}
-        for label, reason in left_out.items():
-            self.say(f"left out: {label}: {reason}")
-        for case, spp in plan.entries:
-            if case.label not in left_out:
+        for case in plan.cases:
+            reason = facts["without"].get(case.type)
+            if facts["paths"] == "light" and case.options.get("paths", "light") != "light":
+                reason = "this scene has only light paths"
+            if reason is not None and plan.default:
+                self.say(f"left out: {case.label}: {reason}")
+                continue
+            for spp in plan.values:
                 self._add("case", case, plan.at(case, spp))
         reference = plan.settled_reference(facts["paths"])
         self._add("reference", reference, plan.of_reference(reference))

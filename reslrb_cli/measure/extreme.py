@@ -21,7 +21,7 @@ from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
 from reslrb_cli.measure.methods import parse_cases
 from reslrb_cli.measure.references import Situation, prb_image
-from reslrb_cli.measure.scenes.case import ReferenceGradients, SceneCase
+from reslrb_cli.measure.scenes.case import Differences, ReferenceGradients, SceneCase
 from reslrb_cli.measure.scenes.catalogue import CASES, IMAGE, PRB, PTRACER
 from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Kind, Reference, Verdict
 
@@ -82,7 +82,7 @@ def _family(setup: Case, runs: Iterable[tuple[SceneCase, Mapping[str, str]]]) ->
     for case, members in runs:
         for name in members.values():
             entries += sizes if case.naive and not ESTIMATORS[name].exact else []
-            along = case.source.directions(setup)
+            along = case.source.directions(setup) if isinstance(case.source, Differences) else 0
             entries += [along] if along else sizes if case.seeds > 1 else []
             entries += [entry_count(tuple(setup.weights.shape))] if case.image else []
     return Family(len(entries), sum(entries), ALPHA / MOST_CASES)
@@ -101,9 +101,7 @@ def _loses_border(case: SceneCase, setup: Case) -> bool:
 
 
 def _hidden_from(case: SceneCase, setup: Case) -> str | None:
-    """Return the reason to leave out camera paths, or None. Camera paths may find no light, or find light too rarely
-    for a z-test.
-    """
+    """Return why camera paths find no light, or find light too rarely for a z-test, or None."""
     depth, hidden = case.options["max_depth"], bool(case.options.get("hide_emitters", False))
     at = Situation.of(setup.scene, setup.scene.sensors()[0], setup.params, depth, hidden, paths="both")
     reason = prb_image(at)

@@ -38,6 +38,7 @@ from reslrb_cli.scene.deformation import Deformation
 from reslrb_cli.scene.dispersion import COEFFICIENT, bends_light
 from reslrb_cli.scene.parameters import Selection
 from reslrb_cli.scene.upsampling import Upsampling
+from reslrb_cli.statistics import rms
 
 #: Size of a direction that moves an object, relative to the object's size.
 REACH = 0.1
@@ -52,6 +53,9 @@ UNITS = {"translation": None, "rotation": 10.0, "scale": REACH, "nd": 0.05, "Vd"
 
 #: Least number of paths whose values are added to a sum in memory at once.
 PACKET = 8
+
+#: Nodes of a difference in steps, with their coefficients, for central and for one-sided differences.
+NODES = {"both": {1: 0.5, -1: -0.5}, "up": {0: -1.5, 1: 2, 2: -0.5}, "down": {0: 1.5, -1: -2, -2: 0.5}}
 
 #: Maximum number of wavelengths across a displaced object.
 WAVES = 1.5
@@ -155,7 +159,7 @@ def directions(case: Case, key: str, bounds: tuple[float, float], count: int) ->
     """
     random, found = np.random.default_rng(3), []
     values, (low, high) = case.initial[key], bounds
-    scale = high - low if np.isfinite(high - low) else float(np.sqrt(np.mean(values**2))) or 1.0
+    scale = high - low if np.isfinite(high - low) else rms(values) or 1.0
     reach = STEPS[0] * scale
     near_a_bound = bool(np.any(values - reach < low) or np.any(values + reach > high))
     inward = np.where(high - values >= values - low, 1.0, -1.0)
@@ -214,14 +218,6 @@ def natural_bounds(kind: str, values: np.ndarray) -> tuple[float, float]:
     if kind != "emitter" and np.all((values >= 0) & (values <= 1)):
         return 0.0, 1.0
     return (0.0, np.inf) if np.all(values >= 0) else (-np.inf, np.inf)
-
-
-def extrapolated(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Combine the differences `near` = D(h) and `far` = D(2 h) so that the error of order h^2 cancels.
-
-    E(h) = (4 D(h) - D(2 h)) / 3 (Richardson 1911).
-    """
-    return np.asarray(near + (near - far) / 3)
 
 
 def embed(case: Case, key: str, row: np.ndarray) -> np.ndarray:
@@ -402,10 +398,8 @@ class Case:
         `sides` is `both` for central differences. At the edge of the domain, `up` or `down` selects one-sided
         differences. All three have an error of second order.
         """
-        nodes = {"both": (1, -1), "up": (0, 1, 2), "down": (0, -1, -2)}[sides]
-        coefficients = {"both": (0.5, -0.5), "up": (-1.5, 2, -0.5), "down": (1.5, -2, 0.5)}[sides]
         total = 0.0
-        for node, coefficient in zip(nodes, coefficients, strict=True):
+        for node, coefficient in NODES[sides].items():
             self.set({key: self.initial[key] + step * node * direction[at] for key, at in self.places.items()})
             total += coefficient * self.weighted(self.image(integrator, seed, spp))
         self.set(self.initial)
@@ -415,8 +409,9 @@ class Case:
         self, integrator: Any, directions: np.ndarray, seeds: Iterable[int], spp: int, step: float, sides: str = "both"
     ) -> np.ndarray:
         """Return finite differences (N, K) along each of K directions at each of N seeds."""
-        fixed = spp, step, sides
-        return np.array([[self.difference(integrator, d, seed, *fixed) for d in directions] for seed in seeds])
+        return np.array(
+            [[self.difference(integrator, d, seed, spp, step, sides) for d in directions] for seed in seeds]
+        )
 
 
 def places(sizes: Mapping[str, int]) -> dict[str, slice]:

@@ -303,16 +303,12 @@ class MeasurementPlan:
         limit = None if variant.startswith("cuda") else memory_bytes(variant)
         plan = cls(config=config, cases=parse_cases(integrators or usual), default=integrators is None, variant=variant,
                    memory_limit=limit, device=device_name(variant), **others)  # fmt: skip
-        for case, value in plan.entries:
-            plan.at(case, value)
+        for case in plan.cases:
+            for value in plan.values:
+                plan.at(case, value)
         if plan.reference is not None:
             plan.of_reference(plan.reference)
         return plan
-
-    @property
-    def entries(self) -> list[tuple[NamedIntegrator, int]]:
-        """The compared cases with each value."""
-        return [(case, value) for case in self.cases for value in self.values]
 
     @property
     def baseline(self) -> NamedIntegrator:

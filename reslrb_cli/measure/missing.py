@@ -382,25 +382,23 @@ def _decide_edges(
     """Return the problem with `edges` on or off, and the records of the shares that are then missing. `found` are the
     records without edges.
     """
-
-    def decided(value: str, why: str) -> Problem:
-        decision = Decision(setting="edges", value=value, why=why)
-        if lacking:
-            say(f"chosen by measurement: {decision.line()}")
-        decisions = [*problem.decisions, decision]
-        return replace(problem, decisions=decisions, integrator=as_decided(tracer, [decision]))
-
     lacking = [record for record in found if record.is_incomplete]
-    if not lacking:
-        return decided("off", "no significant part of the derivative is missing without them"), found
-    edges_on = replace(problem, integrator=as_decided(tracer, [Decision(setting="edges", value="on", why="")]))
-    after = {record.parameter: record for record in measure_missing(edges_on)}
-    clear = next((record for record in lacking if not record.is_unknown), lacking[0])
-    if not any(record.is_reduced_to(after.get(record.parameter)) for record in lacking):
-        why = f"the derivative of {clear.parameter} lacks {clear.percent()} without them, and as much with them"
-        return decided("off", why), found
-    amount = "an unknown share" if clear.is_unknown else clear.percent()
-    return decided("on", f"without them, the derivative of {clear.parameter} lacks {amount}"), list(after.values())
+    value, why = "off", "no significant part of the derivative is missing without them"
+    if lacking:
+        edges_on = as_decided(tracer, [Decision(setting="edges", value="on", why="")])
+        after = {record.parameter: record for record in measure_missing(replace(problem, integrator=edges_on))}
+        clear = next((record for record in lacking if not record.is_unknown), lacking[0])
+        lost = f"the derivative of {clear.parameter} lacks"
+        if any(record.is_reduced_to(after.get(record.parameter)) for record in lacking):
+            amount = "an unknown share" if clear.is_unknown else clear.percent()
+            value, why, found = "on", f"without them, {lost} {amount}", list(after.values())
+        else:
+            why = f"{lost} {clear.percent()} without them, and as much with them"
+    decision = Decision(setting="edges", value=value, why=why)
+    if lacking:
+        say(f"chosen by measurement: {decision.line()}")
+    decisions = [*problem.decisions, decision]
+    return replace(problem, decisions=decisions, integrator=as_decided(tracer, [decision])), found
 
 
 def measure_missing(problem: Problem) -> list[MissingRecord]:

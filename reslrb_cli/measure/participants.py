@@ -25,7 +25,6 @@ from reslrb_cli.measure.references import (
     CAMERA_PATHS,
     Situation,
     choose,
-    divides_by_film,
     ends,
     known_gradient,
     of_gradient,
@@ -144,8 +143,7 @@ class Way:
 
     def named(self, name: str) -> str:
         """Return an item's name with a suffix for the kinds of paths. `name` is its name for light paths."""
-        words = {"light": "", "camera": ", paths: camera", "both": f", paths: both, light_share: {self.light_share:g}"}
-        return name + words[self.paths]
+        return name + "".join(f", {option}: {value}" for option, value in self.options.items())
 
 
 class Participants:
@@ -343,7 +341,7 @@ class Participants:
     def _are_unlike(self, references: Iterable[tuple[Reference | None, str]]) -> bool:
         """Whether some references lose light along the film's border and others do not."""
         sides = {reference in CAMERA_PATHS for reference, _ in references if reference is not None}
-        return len(sides | {divides_by_film(way.paths) for way in self.each_way}) > 1
+        return len(sides | {way.paths != "light" for way in self.each_way}) > 1
 
     def _weigh(self, inside: bool) -> None:
         """Set random weights of mean 1. A sixth of the weights is negative. If light moves, they are smooth.

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
@@ -194,15 +194,12 @@ def _serve(first: dict[str, Any], does: str, connection: Connection) -> None:
     logging.getLogger("reslrb_cli").addHandler(warnings)
     opening, answer_to = begin(first)
     connection.send(opening | {"warnings": [record.getMessage() for record in warnings.buffer]})
-    for question in _questions(connection):
+    while True:
+        try:
+            question = connection.recv()
+        except (EOFError, OSError):  # the other side has closed the connection
+            return
         connection.send(answer_to(question))
-
-
-def _questions(connection: Connection) -> Iterator[dict[str, Any]]:
-    """Yield questions until the other side has closed the connection."""
-    with contextlib.suppress(EOFError, OSError):
-        while True:
-            yield connection.recv()
 
 
 def _limit(memory_limit: int | None) -> None:

@@ -4,9 +4,8 @@ The functions `ptracer_image`, `path_image`, `prb_image`, `ptracer_gradient` and
 each. A function that checks a reference returns the reason against the reference, or None if the reference is valid.
 The section Baselines of docs/method.md explains the reasons.
 
-Light tracing loses light along the film's border, from samples just outside of the film. `divides_by_film` is True for
-images that lose no light along the film's border. `known_gradient` recognises scenes with a known gradient in closed
-form.
+Light tracing loses light along the film's border, from samples just outside of the film. Images with camera paths lose
+no light there. `known_gradient` recognises scenes with a known gradient in closed form.
 """
 
 from __future__ import annotations
@@ -32,13 +31,6 @@ from reslrb_cli.scene.upsampling import values_of
 CAMERA_PATHS = (Reference.PRB, Reference.PATH)
 
 
-def divides_by_film(paths: str) -> bool:
-    """True if images by paths of the kind `paths` (`loading.paths_of`) lose no light along the film's border. Images by
-    `path` lose no light there.
-    """
-    return paths != "light"
-
-
 def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarray) -> np.ndarray | None:
     """Return the gradient of sum(image * weights) by `key` as a flat array, or None if there is no closed form.
 
@@ -56,7 +48,9 @@ def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarr
     )  # fmt: skip
     if not uniform or at.hide_emitters or (at.view.smooth, at.view.emission) != (1, 1):
         return None
-    if float(sensor.film().rfilter().radius()) > 0.5 or not _is_inside(shapes[0], sensor):
+    box, origin = shapes[0].bbox(), np.array(mi.traverse(sensor)["to_world"].translation()).ravel()
+    is_inside = np.linalg.norm(origin - np.array(box.center()).ravel()) < np.array(box.extents()).min() / 2
+    if float(sensor.film().rfilter().radius()) > 0.5 or not is_inside:
         return None
     rho, Le = (np.array(value).ravel() for value in (bsdf["reflectance.value"], emitter["radiance.value"]))
     if at.max_depth == -1 and np.any(rho >= 1):
@@ -67,13 +61,6 @@ def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarr
         return None
     gradient = furnace(rho, Le, at.max_depth, 1).derivatives[name][0, 0] * weights.sum((0, 1))
     return gradient if np.array(at.params[key]).size == 3 else np.array([gradient.sum()])
-
-
-def _is_inside(sphere: mi.Shape, sensor: mi.Sensor) -> bool:
-    box = sphere.bbox()
-    centre, radius = np.array(box.center()).ravel(), np.array(box.extents()).min() / 2
-    origin = np.array(mi.traverse(sensor)["to_world"].translation()).ravel()
-    return bool(np.linalg.norm(origin - centre) < radius)
 
 
 #: Longest paths without roulette; naive AD of stock integrators keeps all segments.
@@ -142,7 +129,7 @@ def of_image(
     valid reference. Integrators that treat the film's border like the estimator come first, in the order of `names`.
     """
     reasons = {Reference.PTRACER: ptracer_image, Reference.PATH: path_image, Reference.PRB: prb_image}
-    ordered = sorted(names, key=lambda name: (name in CAMERA_PATHS) != divides_by_film(at.paths))
+    ordered = sorted(names, key=lambda name: (name in CAMERA_PATHS) != (at.paths != "light"))
     return {name: reasons[name](at) for name in ordered}
 
 
@@ -245,7 +232,8 @@ def ptracer_gradient(at: Situation, key: str) -> str | None:
         return reason
     if moves_light(at.params, key):
         return _ptracer_motion(at, (key,) if key in at.params.properties else at.moved)
-    if _all_zero_somewhere(values_of(at.params, key)):
+    value = np.array(values_of(at.params, key))
+    if np.any(np.all(value.reshape(-1, value.shape[-1] if value.ndim == 3 else value.size) == 0, axis=1)):
         return "it stops paths with throughput 0"
     if parameter_kind(at.params, key) == "emitter":
         return None if key.endswith(".value") else "it differentiates the sampling of a textured emitter"
@@ -319,10 +307,3 @@ def _is_mirrored(shape: mi.Shape) -> bool:
     a, b, c = np.moveaxis(np.array(params["faces"]).reshape(-1, 3), 1, 0)
     across = np.cross(points[b] - points[a], points[c] - points[a])
     return float(np.median(np.sum(across * (normals[a] + normals[b] + normals[c]), axis=1))) < 0
-
-
-def _all_zero_somewhere(value: Any) -> bool:
-    """Whether a texel or colour is 0 in all channels."""
-    array = np.array(value)
-    texels = array.reshape(-1, array.shape[-1]) if array.ndim == 3 else array.reshape(1, -1)
-    return bool(np.any(np.all(texels == 0, axis=1)))

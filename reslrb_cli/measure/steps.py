@@ -95,9 +95,8 @@ class Sampler:
             gradients = problem.gradients()
             dr.eval(gradients, () if result is None else (result.image, result.loss))
         keys = problem.selection.keys if self.quantity != "step" else ()
-        return np.concatenate(
-            [np.zeros(0, np.float32), *(np.array(gradients[k], np.float32).ravel() for k in keys)]
-        ), times
+        rows = [np.array(gradients[key], np.float32).ravel() for key in keys]
+        return np.concatenate([np.zeros(0, np.float32), *rows]), times
 
     def answer(self, question: dict[str, Any], purpose: str) -> dict[str, Any]:
         """Return `values` (N, P) of steps with the given `numbers`, their times, and the number of `new_kernels`.
@@ -111,13 +110,10 @@ class Sampler:
         for number in question["numbers"]:
             at = seed(run_seed, number, self.sensor, purpose)
             found.append(self.step(at, question["spp"], question["image"]))
-        answer: dict[str, Any] = {
-            "values": np.stack([row for row, _ in found]),
-            "step_ms": [times.wall_ms for _, times in found],
-            "kernel_ms": [times.kernel_ms for _, times in found],
-            "codegen_ms": [times.codegen_ms for _, times in found],
-            "new_kernels": sum(times.new_kernels for _, times in found),
-        }
+        answer: dict[str, Any] = {"values": np.stack([row for row, _ in found])}
+        for name, of in (("step_ms", "wall_ms"), ("kernel_ms", "kernel_ms"), ("codegen_ms", "codegen_ms")):
+            answer[name] = [getattr(times, of) for _, times in found]
+        answer["new_kernels"] = sum(times.new_kernels for _, times in found)
         if question["cold"]:
             answer |= {"peak_mib": peak_mib(dr.backend_v(mi.Float)), "scratch_bytes": scratch_bytes(self.clock.history)}
         self.clock.history = []
@@ -248,28 +244,18 @@ def find_references(problem: Problem, objective: str) -> dict[str, Any]:
     """Return the shape and the valid stock integrator for each key."""
     at = Situation.of_problem(problem, problem.sensors[0])
     keys = ["image"] if objective == "image" else list(problem.selection.keys)
-    found: dict[str, dict[Reference, str | None]] = {}
-    for key in keys:
-        found[key] = of_image(at) if objective == "image" else of_gradient(at, key)
-        if objective != "image" and at.attached:
-            found[key][Reference.PTRACER] = _unlike(problem.config) or found[key][Reference.PTRACER]
+    found = {key: of_image(at) if objective == "image" else of_gradient(at, key) for key in keys}
+    own, alike = problem.config.integrator.options(), ALIKE[Reference.PTRACER]
+    if objective != "image" and at.attached and any(own.get(name, value) != value for name, value in alike.items()):
+        words = ", ".join(f"{name}: {value}" for name, value in alike.items())
+        for reasons in found.values():
+            reasons[Reference.PTRACER] = f"its attached derivatives are those of {words}"
     chosen = {key: choose(reasons) for key, reasons in found.items()}
-    independent = {key: None if name is None else name.value for key, (name, _) in chosen.items()}
-    why = {key: reason for key, (_, reason) in chosen.items()}
-    without = {
-        name.value: reason
-        for name, reason in found[keys[0]].items()
-        if all(reasons[name] is not None for reasons in found.values())
-    }
-    shapes = {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"}
-    return {"shapes": shapes, "independent": independent, "why": why, "without": without, "paths": problem.paths}
-
-
-def _unlike(config: Config) -> str | None:
-    """Return why naive AD's derivatives of moving parameters differ from the derivatives that the experiment requests,
-    or None.
-    """
-    options, alike = config.integrator.options(), ALIKE[Reference.PTRACER]
-    if all(options.get(name, value) == value for name, value in alike.items()):
-        return None
-    return "its attached derivatives are those of " + ", ".join(f"{name}: {value}" for name, value in alike.items())
+    return {
+        "shapes": {key: list(value_shape(problem.selection.value(key))) for key in keys if key != "image"},
+        "independent": {key: None if name is None else name.value for key, (name, _) in chosen.items()},
+        "why": {key: reason for key, (_, reason) in chosen.items()},
+        "without": {name.value: reason for name, reason in found[keys[0]].items()
+                    if all(reasons[name] is not None for reasons in found.values())},
+        "paths": problem.paths,
+    }  # fmt: skip

@@ -110,6 +110,20 @@ def test_a_stopped_suite_keeps_finished_cases(tmp_path: Path, monkeypatch: pytes
     assert [row["case"] for row in measured(file)] == ["first"] * 2
 
 
+def test_a_tag_selects_its_cases(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    from reslrb_cli.measure import extreme
+    from reslrb_cli.measure.scenes.catalogue import TAGGED
+
+    taken: list[str] = []
+    monkeypatch.setattr(extreme, "run_case", lambda case, *_: taken.append(case.name) or iter(()))
+    assert gradcheck.SUITES == ("extreme", *TAGGED)
+    names = [case.name for case in TAGGED["glass"]]
+    assert call("--suite", "glass") == call("--suite", f"glass:{names[2]},{names[0]}") == 0
+    assert taken == [*names, names[2], names[0]]
+    assert call("--suite", "glass:furnace") == 2
+    assert "there is no case `furnace`" in capsys.readouterr().err
+
+
 def test_a_suite_names_its_open_cases(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     from reslrb_cli.measure import extreme
 

@@ -22,7 +22,7 @@ from reslrb_cli.integrators.step import gradient_step
 from reslrb_cli.measure.comparison import Family, compare_expectations
 from reslrb_cli.measure.gradients import integrator, relative, seeds
 from reslrb_cli.measure.scenes.case import SceneCase
-from reslrb_cli.measure.scenes.moving import Move, Pose
+from reslrb_cli.measure.scenes.moving import Move, pose
 from reslrb_cli.measure.scenes.small import diffuse
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -40,7 +40,7 @@ BY_NAME = {case.name: case for case in CASES}
 ONE = attached("one", "one diffuse vertex in the chain", lambda: room(wall=wall(diffuse(0.8, 0.7, 0.6))), moved,
                     spp=64, options={"max_depth": 5})  # fmt: skip
 TWO = attached("two", "two diffuse vertices in the chain", shelf, moved, spp=64, options={"max_depth": 6})
-BOTH = replace(TWO, name="both", moves=lambda _: [Pose("floor.to_world", ("ty",)), Pose("wall.to_world", ("tx",))])
+BOTH = replace(TWO, name="both", moves=lambda _: [pose("floor.to_world", ("ty",)), pose("wall.to_world", ("tx",))])
 
 
 @pytest.mark.parametrize(
@@ -243,11 +243,11 @@ def lit_wall(bsdf: dict[str, Any] = WHITE) -> dict[str, Any]:
 
 
 def tilted(scene: Any) -> list[Move]:
-    return [Pose("floor.to_world", ("ty", "rx", "rz"))]
+    return [pose("floor.to_world", ("ty", "rx", "rz"))]
 
 
 def pushed(scene: Any) -> list[Move]:
-    return [Pose("wall.to_world", ("tx", "ry", "rz"), (1, 1, 0))]
+    return [pose("wall.to_world", ("tx", "ry", "rz"), (1, 1, 0))]
 
 
 def rough(name: str) -> SceneCase:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from reslrb_cli.measure.gradients import smooth_weights
 from reslrb_cli.measure.scenes.analytic import fresnel
 from reslrb_cli.measure.scenes.case import SceneCase
-from reslrb_cli.measure.scenes.moving import FILTER, Pose
+from reslrb_cli.measure.scenes.moving import FILTER, pose
 from reslrb_cli.measure.scenes.small import glass, lit_square, rectangle, rgb, transform
 
 Array = NDArray[np.float64]
@@ -83,7 +83,7 @@ def tilted_surface(tilt: float = 0.3, ior: float = 1.5, height: float = 1.4, hal
     scene = attached(
         "tilted_surface", "parallel light on a tilted surface of glass",
         lambda: setting(lamp=parallel(half, 0, 3, 50.0), top=surface),
-        lambda scene: [Pose("top.to_world", ("rz",), (0, height, 0))], options={"max_depth": 3},
+        lambda scene: [pose("top.to_world", ("rz",), (0, height, 0))], options={"max_depth": 3},
     )  # fmt: skip
     known = np.array([RHO.sum() / np.pi * flux * slope])
     return KnownMotion(scene, centre_of_gravity(), known, 1e-3)
@@ -107,7 +107,7 @@ def ball_lens(radius: float = 2.4, ior: float = 1.5, offset: float = 0.04, half:
         lambda: setting(lamp=parallel(half, offset, f + radius + 1, 5e4),
                         lens={"type": "sphere", "center": [0, f, 0], "radius": radius,
                               "bsdf": glass(ior)}),
-        lambda scene: [Pose("lens.to_world", ("tx", "ty", "s"), (0, f, 0))],
+        lambda scene: [pose("lens.to_world", ("tx", "ty", "s"), (0, f, 0))],
     )  # fmt: skip
     return KnownMotion(scene, centre_of_gravity(), RHO.sum() / np.pi * flux * passed * slopes, 2e-3)
 
@@ -131,7 +131,7 @@ def lamp_over_plane(position: tuple[float, float, float] = (0.1, 0.7, 0.2), node
     known = np.einsum("kij,ij,ijc,c->k", slopes, area, g, RHO / np.pi * intensity)
     scene = attached(
         "lamp_over_plane", "a point light over a plane", lambda: setting(lamp=point(position)),
-        lambda scene: [Pose("lamp.position", ("tx", "ty", "tz"))], options={"max_depth": 2},
+        lambda scene: [pose("lamp.position", ("tx", "ty", "tz"))], options={"max_depth": 2},
     )  # fmt: skip
     return KnownMotion(scene, G, known, 1e-3)
 

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from reslrb_cli.measure.scenes.case import SceneCase
 from reslrb_cli.measure.scenes.moving import (
     FILTER,
-    Displacement,
     Move,
-    Number,
-    Pose,
+    displacement,
     grid,
     mesh,
+    number,
+    pose,
     smooth_fields,
     vertices,
     waves,
@@ -84,11 +84,11 @@ def waving(scene: Any, name: str = "top", height: float = 1.8, count: int = 10) 
     positions = vertices(scene, name)
     amplitude = np.zeros_like(positions)
     amplitude[:, 1] = (positions[:, 1] - height) * 3
-    return [Displacement(f"{name}.vertex_positions", np.stack([amplitude, *smooth_fields(positions, count, 1.0)]))]
+    return [displacement(f"{name}.vertex_positions", np.stack([amplitude, *smooth_fields(positions, count, 1.0)]))]
 
 
 def moving_sphere(name: str, pivot: tuple[float, float, float]) -> list[Move]:
-    return [Pose(f"{name}.to_world", ("tx", "ty", "tz", "s"), pivot)]
+    return [pose(f"{name}.to_world", ("tx", "ty", "tz", "s"), pivot)]
 
 
 def beam(half: float = 0.3) -> dict:
@@ -112,7 +112,7 @@ GLASS_SCENES = [
     attached("rough_surface", "rough glass with waves, the receiver inside", rough_surface, waving,
                   spp=512, seeds=32, options={"max_depth": 3}),
     attached("rough_surface_alpha", "the roughness of rough glass", rough_surface,
-                  lambda scene: [Number("top.bsdf.alpha.value")], step=0.03, spp=512, seeds=32,
+                  lambda scene: [number("top.bsdf.alpha.value")], step=0.03, spp=512, seeds=32,
                   options={"max_depth": 3, "attached": True}),
 ]  # fmt: skip
 
@@ -152,14 +152,14 @@ def rolling(scene: Any, name: str = "floor", y: float = 0) -> list[Move]:
     about = positions - [0, y, 0]
     near = np.exp(-np.square(about / 1.5).sum(1))[:, None]
     hills = about * [0, 4, 0]
-    return [Displacement(f"{name}.vertex_positions", np.stack([hills, *smooth_fields(positions, 10, 1.5)]) * near)]
+    return [displacement(f"{name}.vertex_positions", np.stack([hills, *smooth_fields(positions, 10, 1.5)]) * near)]
 
 
 PLACES_SCENES = [
     attached("moved_point", "a point light over a plane", lambda: setting(lamp=point()),
-                  lambda scene: [Pose("lamp.position", ("ty", "tx", "tz"))], options={"max_depth": 2}),
+                  lambda scene: [pose("lamp.position", ("ty", "tx", "tz"))], options={"max_depth": 2}),
     attached("moved_receiver", "a plane under a point light, moved and tilted", lambda: setting(lamp=point()),
-                  lambda scene: [Pose("floor.to_world", ("ty", "rx", "rz"))], options={"max_depth": 2}),
+                  lambda scene: [pose("floor.to_world", ("ty", "rx", "rz"))], options={"max_depth": 2}),
     attached("bent_receiver", "a plane under a point light that is bent", hills, rolling,
                   options={"max_depth": 2}, spp=256),
 ]  # fmt: skip

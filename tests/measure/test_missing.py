@@ -27,7 +27,7 @@ from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.missing import LineSegment, MissingCheck, Tracing, _ratio, missing_record
 from reslrb_cli.measure.scenes.analytic import fresnel
 from reslrb_cli.measure.scenes.case import SceneCase
-from reslrb_cli.measure.scenes.moving import Displacement, Move, Pose, smooth_fields, vertices
+from reslrb_cli.measure.scenes.moving import Move, displacement, pose, smooth_fields, vertices
 from reslrb_cli.measure.scenes.small import transform
 from reslrb_cli.optimization import targets
 from reslrb_cli.records.measurements import LEAST, MissingRecord, Reference, Verdict
@@ -66,7 +66,7 @@ def half_covered(moved: str) -> SceneCase:
     return attached(
         f"half_covered, {moved}", "a black sheet in a parallel beam",
         lambda: setting(lamp=parallel(HALF, 0, 3, 10.0), cover=cover),
-        lambda scene: [Pose(f"{moved}.to_world", ("tx",), (0, 0, 0))], options={"max_depth": 2},
+        lambda scene: [pose(f"{moved}.to_world", ("tx",), (0, 0, 0))], options={"max_depth": 2},
     )  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def slab_in_a_beam() -> SceneCase:
         "slab_in_a_beam", "a beam on a narrower surface of glass",
         lambda: setting(lamp=parallel(HALF, 0, 3, 10.0),
                         top={"type": "rectangle", "bsdf": glass, "to_world": place @ size}),
-        lambda scene: [Pose("top.to_world", ("rz",), (0, HEIGHT, 0))], options={"max_depth": 3},
+        lambda scene: [pose("top.to_world", ("rz",), (0, HEIGHT, 0))], options={"max_depth": 3},
     )  # fmt: skip
 
 
@@ -231,7 +231,7 @@ def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
     """
 
     def moves(scene: Any) -> list[Move]:
-        return [Displacement("top.vertex_positions", smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array(only))]
+        return [displacement("top.vertex_positions", smooth_fields(vertices(scene, "top"), 3, 1.0) * np.array(only))]
 
     return compare_with_differences(replace(SCENES["slab_beam"], moves=moves), count=seeds)
 

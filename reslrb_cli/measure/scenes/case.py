@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from reslrb_cli.measure.gradients import Case, extrapolated, integrator
+from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.gradients import seeds as seeds_of
+from reslrb_cli.measure.methods import PATHS_OPTIONS
 from reslrb_cli.measure.scenes.analytic import KnownScene
 from reslrb_cli.measure.scenes.moving import Move, moving_case
 from reslrb_cli.records.measurements import Reference
+from reslrb_cli.statistics import rms
 
 Scene = Callable[[], dict]
 Moves = Callable[[Any], Sequence[Move]]
@@ -49,9 +51,6 @@ class Stock:
     def reference(self) -> Reference:
         return Reference(self.name)
 
-    def directions(self, setup: Case) -> int:
-        return 0
-
     def samples(self, case: SceneCase, setup: Case) -> ReferenceGradients:
         other = setup if self.scene is None else Case(self.scene(), case.keys)
         other.weights = setup.weights
@@ -70,8 +69,8 @@ class Differences:
     paths do not depend on the parameters and the image is a polynomial of degree 2.
 
     With `left`, they are along each amplitude of a motion, and differences with twice the step correct them
-    (`extrapolated`). The assumed error is a tenth of the correction, plus the fraction `left` of the root mean square
-    of the differences. The `left` part covers the faces of a mesh and higher powers of the step.
+    (Richardson's extrapolation). The assumed error is a tenth of the correction, plus the fraction `left` of the root
+    mean square of the differences. The `left` part covers the faces of a mesh and higher powers of the step.
     """
 
     step: float
@@ -85,15 +84,18 @@ class Differences:
     def samples(self, case: SceneCase, setup: Case) -> ReferenceGradients:
         along = setup.directions(2) if self.left is None else np.eye(setup.size)
         along = along if self.sides == "both" else np.abs(along)
-        tracer = integrator("reslrb", **case.without_roulette, **case.way)
+        way = {name: case.ours[name] for name in PATHS_OPTIONS if name in case.ours}
+        tracer = integrator("reslrb", **case.without_roulette, **way)
         paired = "rr_depth" not in case.options
         chosen = seeds_of(case.seeds, 0 if paired else 1)
         near = setup.differences(tracer, along, chosen, case.spp, self.step, self.sides)
         if self.left is None:
             return ReferenceGradients(near, paired, along)
-        values = extrapolated(near, setup.differences(tracer, along, chosen, case.spp, 2 * self.step))
-        size = float(np.sqrt(np.mean(np.square(values.mean(0)))))
-        return ReferenceGradients(values, paired, along, np.abs((values - near).mean(0)) / 10 + self.left * size)
+        # E(h) = (4 D(h) - D(2 h)) / 3: the error of order h^2 cancels (Richardson 1911).
+        correction = (near - setup.differences(tracer, along, chosen, case.spp, 2 * self.step)) / 3
+        values = near + correction
+        bias = np.abs(correction.mean(0)) / 10 + self.left * rms(values.mean(0))
+        return ReferenceGradients(values, paired, along, bias)
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,6 @@ class Exact:
 
     known: Callable[[], KnownScene]
     reference = Reference.ANALYTIC
-
-    def directions(self, setup: Case) -> int:
-        return 0
 
     def samples(self, case: SceneCase, setup: Case) -> ReferenceGradients:
         return ReferenceGradients(self.known().gradient(setup.weights))
@@ -155,11 +154,6 @@ class SceneCase:
     def own(self) -> dict[str, Any]:
         """The options of `reslrb` and `walk_ad`."""
         return {**self.options, **self.ours}
-
-    @property
-    def way(self) -> dict[str, Any]:
-        """The options that set the kinds of paths."""
-        return {name: self.ours[name] for name in ("paths", "light_share") if name in self.ours}
 
     @property
     def without_roulette(self) -> dict[str, Any]:

@@ -27,12 +27,12 @@ from reslrb_cli.measure.scenes.analytic import (
 from reslrb_cli.measure.scenes.case import Differences, Moves, SceneCase, Stock, exact
 from reslrb_cli.measure.scenes.moving import (
     FILTER,
-    Displacement,
     Move,
-    Number,
-    Pose,
+    displacement,
     grid,
     mesh,
+    number,
+    pose,
     smooth_fields,
     vertices,
     waves,
@@ -306,7 +306,7 @@ def _followed(kind: str, roughness: str) -> SceneCase:
         scene, (), Differences(0.05 * float(roughness), left=2e-3), image="", spp=256, signed=True,
         seeds=FOLLOWED[kind, roughness],
         options={"max_depth": 3},  # from the plate to the floor: the edges beyond do not move
-        ours={"attached": True}, equal=5e-4, moves=lambda scene: [Number("plate.bsdf.alpha.value")],
+        ours={"attached": True}, equal=5e-4, moves=lambda scene: [number("plate.bsdf.alpha.value")],
     )  # fmt: skip
 
 
@@ -475,8 +475,8 @@ def bending(size: float = 1, scale: float = 1, axes: Any = (1, 1, 1), lamp: bool
 
     def moves(scene: Any) -> Sequence[Move]:
         fields = size * scale * smooth_fields(vertices(scene, "top") / scale, 3, 1.0) * np.array(axes)
-        beside = [Pose("lamp.to_world", ("tx", "rz"), (0.5, 3, 0))] if lamp else []
-        return [Displacement("top.vertex_positions", fields), *beside]
+        beside = [pose("lamp.to_world", ("tx", "rz"), (0.5, 3, 0))] if lamp else []
+        return [displacement("top.vertex_positions", fields), *beside]
 
     return moves
 

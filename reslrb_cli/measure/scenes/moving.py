@@ -101,44 +101,41 @@ DEGREES = 57.29577951308232
 
 
 @dataclass(frozen=True)
-class Displacement:
-    """Moves the vertices of a mesh by the sum of amplitude k times `fields[k]`. `fields` has the shape (K, V, 3)."""
+class Move:
+    """Motion of a scene object by `size` amplitudes. `key` is as in `mi.traverse`.
+
+    `value` returns the value of `key` for its initial value and the amplitudes, which have the width 1. At amplitudes
+    of 0, it is the initial value.
+    """
 
     key: str
-    fields: np.ndarray
+    size: int
+    value: Callable[[Any, Sequence[mi.Float]], Any]
 
-    @property
-    def size(self) -> int:
-        return len(self.fields)
 
-    def value(self, initial: mi.Float, amplitudes: list[mi.Float]) -> mi.Float:
+def displacement(key: str, fields: np.ndarray) -> Move:
+    """Move the vertices of a mesh by the sum of amplitude k times `fields[k]`. `fields` has the shape (K, V, 3)."""
+
+    def value(initial: mi.Float, amplitudes: Sequence[mi.Float]) -> mi.Float:
         result = mi.Float(initial)
-        for row, amplitude in zip(self.fields, amplitudes, strict=True):
+        for row, amplitude in zip(fields, amplitudes, strict=True):
             result += amplitude * own_memory(mi.Float, row.ravel().astype(np.float32))
         return result
 
+    return Move(key, len(fields), value)
 
-@dataclass(frozen=True)
-class Pose:
-    """Moves a `to_world` or a position by the degrees of freedom in `freedom`, in their order.
+
+def pose(key: str, freedom: Sequence[str], pivot: Sequence[float] = (0.0, 0.0, 0.0)) -> Move:
+    """Move a `to_world` or a position by the degrees of freedom in `freedom`, in their order.
 
     `tx`, `ty` and `tz` are translations in scene units. `rx`, `ry`, `rz` (radians) and `s` (scale, 1 + amplitude) act
     about `pivot`.
     """
 
-    key: str
-    freedom: tuple[str, ...]
-    pivot: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @property
-    def size(self) -> int:
-        return len(self.freedom)
-
-    def value(self, initial: Any, amplitudes: list[mi.Float]) -> Any:
-        zero = dr.opaque(mi.Float, 0)
-        T, result = mi.AffineTransform4f, mi.AffineTransform4f()
-        there, back = (T().translate([dr.opaque(mi.Float, s * x) for x in self.pivot]) for s in (1, -1))
-        for name, amplitude in zip(self.freedom, amplitudes, strict=True):
+    def value(initial: Any, amplitudes: Sequence[mi.Float]) -> Any:
+        T, zero, result = mi.AffineTransform4f, dr.opaque(mi.Float, 0), mi.AffineTransform4f()
+        there, back = (T().translate([dr.opaque(mi.Float, s * x) for x in pivot]) for s in (1, -1))
+        for name, amplitude in zip(freedom, amplitudes, strict=True):
             axis = [1 if name[-1] == other else 0 for other in "xyz"]
             if name[0] == "t":
                 step = T().translate([amplitude if on else zero for on in axis])
@@ -147,25 +144,14 @@ class Pose:
             else:
                 step = there @ T().scale([1 + amplitude] * 3) @ back
             result = step @ result
-        if isinstance(initial, mi.Point3f):
-            return result @ initial
-        return result @ mi.AffineTransform4f(initial)
+        return result @ (initial if isinstance(initial, mi.Point3f) else T(initial))
+
+    return Move(key, len(freedom), value)
 
 
-@dataclass(frozen=True)
-class Number:
-    """Adds its single amplitude to a number, such as a roughness."""
-
-    key: str
-    size: int = 1
-
-    def value(self, initial: Any, amplitudes: list[mi.Float]) -> Any:
-        return type(initial)(initial + amplitudes[0])
-
-
-#: A scene object (`key` as in `mi.traverse`) moved by `size` amplitudes; at zero it has the scene's values. `value` is
-#: the value of `key` with its derivative by the amplitudes, each of width 1.
-Move = Displacement | Pose | Number
+def number(key: str) -> Move:
+    """Add one amplitude to a number, such as a roughness."""
+    return Move(key, 1, lambda initial, amplitudes: type(initial)(initial + amplitudes[0]))
 
 
 @dataclass

@@ -99,12 +99,9 @@ def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: in
 
 
 def compare(
-    own: Sequence[Gradients],
-    own_ms: Sequence[float],
-    other: Sequence[Gradients],
-    other_ms: Sequence[float],
+    own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float],
     confidence: float = CONFIDENCE,
-) -> Gain | None:
+) -> Gain | None:  # fmt: skip
     """Return the efficiency of `other` divided by the efficiency of `own`, with the confidence interval of the ratio.
 
     `own` and `other` have the gradients of at least three steps, by parameter. `own_ms` and `other_ms` have the times
@@ -206,13 +203,6 @@ def sizes(problem: Problem, longer: float, planned: float = PLANNED) -> Sizes:
     return Sizes(spp, call, pass_spp(config), alone, rounds, learned, longer, planned)
 
 
-#: Take a plain step or one with the option, given a round and the samples per pixel, with the learned table, which
-#: stays unchanged. Equal rounds have equal seeds, different from those of any walk for learning.
-Take = Callable[[bool, int, int], Step]
-#: Update the table from a walk of a round with these samples per pixel; unmeasured times stay 0.
-Learn = Callable[[int, int], Step]
-
-
 @dataclass(frozen=True)
 class Finding:
     """Result of a race. `other` tells whether the other way is better.
@@ -236,7 +226,8 @@ class Finding:
 
 
 class Turns:
-    """A race. `take` takes its steps. If a table must learn, `learn` provides the learning walks.
+    """A race. `take(other, round, spp)` takes its steps, with a learned table that stays unchanged. If a table must
+    learn, `learn(round, spp)` updates it from a walk, with seeds that no step has.
 
     The race ends after `limit_s` seconds. With `guides`, the other way is guided, and its time includes the learning of
     the run. Otherwise, the race takes all planned rounds first, or as many as a step has samples. Steps of
@@ -244,8 +235,9 @@ class Turns:
     """
 
     def __init__(
-        self, take: Take, sizes: Sizes, limit_s: float, learn: Learn | None = None, guides: bool = False
-    ) -> None:
+        self, take: Callable[[bool, int, int], Step], sizes: Sizes, limit_s: float,
+        learn: Callable[[int, int], Step] | None = None, guides: bool = False,
+    ) -> None:  # fmt: skip
         self._spent_ms = 0.0
         self._take, self._learn, self._sizes = take, learn, sizes
         self._limit_ms, self._guides = 1e3 * limit_s, guides
