@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -109,6 +110,48 @@ def test_a_copied_folder_gets_its_own_environment(tmp_path: Path, python: Path) 
     assert (first / ".venv/bin/reslrb").exists()
 
 
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with `scripts/test`, and with fake programs that it starts."""
+    for folder in ("scripts", ".venv/bin"):
+        (tmp_path / folder).mkdir(parents=True)
+    shutil.copy(ROOT / "scripts/test", tmp_path / "scripts/test")
+    make_program(tmp_path / "scripts/setup", "#!/bin/sh\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize("broken", ["none", "ruff check", "ruff format", "mypy", "pytest -n"])
+def test_the_suite_fails_with_each_of_its_checks(checkout: Path, broken: str) -> None:
+    text = f"""#!/bin/sh\necho "out: $2 $3"; case "$2 $3" in "{broken}"*) echo bad >&2; exit 3 ;; esac\n"""
+    make_program(checkout / ".venv/bin/python", text)
+    done = subprocess.run(checkout / "scripts/test", stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert done.returncode == (broken != "none")
+    assert re.findall(r"^out: (.*\w)", done.stdout, re.M) == ["ruff check", "ruff format", "pytest -n", "mypy"]
+    assert re.findall("^bad|^failed: .*", done.stdout, re.M) == (
+        [] if broken == "none" else ["bad", f"failed: {broken}"]
+    )
+
+
+def test_an_interrupted_suite_leaves_no_process(checkout: Path) -> None:
+    text = """#!/bin/sh
+    case "$2" in
+    mypy) echo $$ >mypy; exec sleep 60 ;;
+    pytest) trap 'exit 2' INT; while [ ! -s mypy ]; do sleep 0.01; done; echo ready; sleep 10 ;;
+    esac
+    """
+    make_program(checkout / ".venv/bin/python", text.replace("\n    ", "\n"))
+    suite = subprocess.Popen(checkout / "scripts/test", stdout=subprocess.PIPE, text=True, start_new_session=True)
+    assert suite.stdout is not None
+    assert "ready\n" in suite.stdout
+    os.killpg(suite.pid, signal.SIGINT)
+    assert suite.wait(5) == 130
+    mypy = Path("/proc", (checkout / "mypy").read_text().strip(), "cmdline")
+    end = time.monotonic() + 5
+    while mypy.exists() and mypy.read_bytes() and time.monotonic() < end:  # a zombie has no command
+        time.sleep(0.01)
+    assert not mypy.exists() or not mypy.read_bytes()
+
+
 def test_without_chromium_the_tests_say_so_in_one_line(
     monkeypatch: pytest.MonkeyPatch, pytestconfig: pytest.Config
 ) -> None:
@@ -123,8 +166,11 @@ def test_without_chromium_the_tests_say_so_in_one_line(
     assert [line.partition(":")[0] for line in said] == ["no Chromium"]
 
 
-@pytest.mark.skipif(
-    Path(sys.prefix) != ROOT / ".venv" or (ROOT / ".venv").is_symlink(),  # setup would replace a foreign environment
+STAMP = ROOT / ".venv/.setup-test"
+
+
+@pytest.mark.skipif(  # setup would replace a foreign environment
+    Path(sys.prefix) != ROOT / ".venv" or not STAMP.is_file() or not STAMP.read_text().startswith(f"{ROOT} "),
     reason="runs in the environment that scripts/setup made",
 )
 def test_a_second_setup_changes_nothing() -> None:
