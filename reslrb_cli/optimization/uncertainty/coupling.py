@@ -4,13 +4,15 @@ The directions of `curvature.py` change the brightness of a texture as a whole. 
 
 **A small parameter and textures.** The tint of a mirror, and the texels that only the mirror shows, give the same image
 if one rises and the others fall. Let J u be the change of the image by a small parameter, and H the curvature of a
-texture with the values x. The change d of the texels that makes up for u best is approximated by
+texture with the values x. The change d of the texels makes up for u best if H d = -J^T W J u. It is approximated by
+`ROUNDS` steps of accelerated gradient descent (Nesterov 1983).
 
-    b = J^T W J u,   r = H x / x,   d = -b / r
+    d <- d - J^T W J (u + d) / r,   r = H x / x
 
-A matrix H without negative entries satisfies diag(r) >= H, so d never makes up for more than the best change does.
-`followed` returns the changes in which d accompanies u. The curvature along such a change is the one that remains if
-the textures may follow.
+A matrix H without negative entries satisfies diag(r) >= H, so these steps converge. `followed` returns the changes in
+which d accompanies u. The curvature along such a change is the one that remains if the textures may follow. A gradient
+along u + d does not depend on the offsets of the textures. If u is off by one spread, the texels are off by d spreads
+(`texel_offsets`).
 
 **Maps of one shape.** The colour, the roughness and the metallic weight of a texel change the same pixels. A shape is
 divided into cells, which are the texels of its coarsest map, or the vertices of a mesh. A and B are two maps of the
@@ -52,6 +54,8 @@ from reslrb_cli.statistics import Array, rms
 
 #: Noise of M, as a share of its mean diagonal, at which measurements end. It hides smaller eigenvalues.
 MOST_NOISE = 0.1
+#: Renderings in the search for the texels that compensate for a small parameter.
+ROUNDS = 8
 
 
 def followed(
@@ -72,16 +76,17 @@ def followed(
             value = np.abs(row_of(problem, key))
             # The noise of r makes d too small rather than too large.
             sums = sum((a + b) / 2 + np.abs(a - b) / 2 for a, b in samples)
-            stiff[key] = np.where(value > 0, sums, 0.0) / np.where(value > 0, value, 1.0)
+            stiff[key] = np.where(free[key] & (value > 0), sums, 0.0) / np.where(value > 0, value, 1.0)
     found: list[ParameterChange] = []
+    together = all(separates(problem, key) for key in stiff)
     for change in changes if stiff else ():
         if change.directions[0].key in free:
             continue
-        for direction in change.directions:
+        split = [] if together else [_alone(problem, change, direction) for direction in change.directions]
+        for part in split or [change]:
             if not go_on():
                 return found
-            alone = _alone(problem, change, direction)
-            found += _with_textures(problem, alone, curvature.products(alone)[0], stiff, free)
+            found += _best(curvature, part, stiff, go_on)
     return found
 
 
@@ -104,6 +109,19 @@ def with_followed(
     return [directions[place] for place in chosen], np.diag(H)[:count], H[at], B[at]
 
 
+def texel_offsets(directions: Sequence[ParameterDirection], spreads: Sequence[float]) -> dict[str, tuple[Array, str]]:
+    """Return the mean square offset of each texel (N,) that follows small parameters with these spreads. Also return
+    the parameter that causes most of it. The results are by texture.
+    """
+    parts: dict[str, dict[str, Array]] = {}
+    for direction, spread in zip(directions, spreads, strict=True):
+        for key, d in direction.followers.items():
+            by_source = parts.setdefault(key, {})
+            by_source[direction.key] = by_source.get(direction.key, 0.0) + (spread * d) ** 2
+    return {key: (np.sum(list(found.values()), axis=0), max(found, key=lambda name: float(found[name].sum())))
+            for key, found in parts.items()}  # fmt: skip
+
+
 def _alone(problem: Problem, change: ParameterChange, direction: ParameterDirection) -> ParameterChange:
     """Return the part of a change along one of its directions."""
     row = row_of(problem, direction.key) + change.amount * direction.vector
@@ -111,30 +129,58 @@ def _alone(problem: Problem, change: ParameterChange, direction: ParameterDirect
     return ParameterChange({direction.key: array}, change.amount, [direction])
 
 
-def _with_textures(
-    problem: Problem,
-    change: ParameterChange,
-    product: Mapping[str, tuple[Array, Array]],
-    stiff: Mapping[str, Array],
-    free: Mapping[str, Array],
+def _best(
+    curvature: LossCurvature, change: ParameterChange, stiff: Mapping[str, Array], go_on: Callable[[], bool]
 ) -> list[ParameterChange]:
-    """Add the changes of textures to a change of a small parameter. Return no change if no texture moves."""
-    values, shares, (direction,) = dict(change.values), dict[str, float](), change.directions
-    for key, r in stiff.items():
-        b, low_high = np.mean(product[key], axis=0), problem.selection.specs[key].bounds or (-np.inf, np.inf)
-        use = free[key] & (r > 0)
-        d = np.where(use, b, 0.0) / np.where(use, r, 1.0)
-        if d.any():
-            row = row_of(problem, key)
-            moved = np.clip(row - change.amount * d, np.minimum(low_high[0], row), np.maximum(low_high[1], row))
-            values[key] = _shown(problem, key, moved)
-            shares[key] = float(product[key][0] @ d)
-    if not shares:
+    """Return a change of a small parameter with the changes of the textures that compensate for it best, or no change
+    if no texture moves. `stiff` has r (N,) for each texture.
+    """
+    problem, key = curvature.problem, change.directions[0].key
+    unit = np.sum([direction.vector for direction in change.directions], axis=0)
+    whole = replace(change.directions[0], vector=unit, channel=None)
+    if len(change.directions) == 1:
+        whole = change.directions[0]
+    last = d = after = best = {name: np.zeros(r.size) for name, r in stiff.items()}
+    least, first = np.inf, dict[str, Array]()
+    for number in range(ROUNDS):
+        moved, d = _together(problem, change, d)
+        (samples,) = curvature.products(replace(moved, directions=[whole]))
+        product = {name: np.mean(both, axis=0) for name, both in samples.items()}
+        after = {name: d[name] - np.where(r > 0, product[name], 0.0) / np.where(r > 0, r, 1.0)
+                 for name, r in stiff.items()}  # fmt: skip
+        left = float(product[key] @ unit) + sum(float(product[name] @ part) for name, part in d.items())
+        if number == 0:
+            first, best = product, after
+        elif left < least:
+            best, least = d, left
+        if not go_on():
+            break
+        d = {name: row + number / (number + 3) * (row - last[name]) for name, row in after.items()}
+        last = after
+    if not any(row.any() for row in best.values()):
         return []
-    free_of_channels = all(separates(problem, key) for key in shares)
-    partner = max(shares, key=lambda key: shares[key])
-    channel = direction.channel if free_of_channels else None
-    return [ParameterChange(values, change.amount, [replace(direction, channel=channel, partner=partner)])]
+    moved, best = _together(problem, change, best)
+    directions = []
+    for direction in change.directions:
+        parts = best if direction is whole else {
+            name: np.where(np.arange(row.size) % 3 == direction.channel, row, 0.0) for name, row in best.items()
+        }  # fmt: skip
+        partner = max(parts, key=lambda name: abs(float(first[name] @ parts[name])))
+        channel = direction.channel if all(separates(problem, name) for name in parts) else None
+        directions.append(replace(direction, channel=channel, partner=partner, followers=parts))
+    return [replace(moved, directions=directions)]
+
+
+def _together(
+    problem: Problem, change: ParameterChange, d: Mapping[str, Array]
+) -> tuple[ParameterChange, dict[str, Array]]:
+    """Add the changes `d` of textures to a change of a small parameter. Also return `d` within the bounds."""
+    values, inside = dict(change.values), {}
+    for key, part in d.items():
+        row, (low, high) = row_of(problem, key), problem.selection.specs[key].bounds or (-np.inf, np.inf)
+        moved = np.clip(row + change.amount * part, np.minimum(low, row), np.maximum(high, row))
+        values[key], inside[key] = _shown(problem, key, moved), (moved - row) / change.amount
+    return replace(change, values=values), inside
 
 
 def _shown(problem: Problem, key: str, row: Array) -> Array:

@@ -42,7 +42,7 @@ look too certain.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -75,7 +75,7 @@ REPLICAS, AGAIN = 4, 4
 LINEAR = 1e-3
 #: Maximum factor by which they are made brighter or darker.
 MOST_ASTRAY = 10.0
-#: Samples for probes of large parameters, and the number of the first sample for products.
+#: Samples for probes of large parameters, and the number of the sample of products.
 PROBED, FIRST_PRODUCT = 2, 1000
 
 
@@ -84,8 +84,9 @@ class ParameterDirection:
     """One coordinate. `vector` is the change of the parameter `key` per unit, in the layout of a flat gradient.
 
     `channel` is the only image channel that the direction changes, or None. `entry` is the entry of a small parameter.
-    `entry` is None if all entries of a texture's channel change together, in proportion to their values. `partner` is
-    the texture whose entries compensate for the change of a small parameter (`coupling.py`).
+    `entry` is None if all entries of a texture's channel change together, in proportion to their values. `followers`
+    has the change (N,) per unit of each texture that compensates for the change of a small parameter (`coupling.py`).
+    `partner` is the texture that compensates for most of it.
     """
 
     key: str
@@ -93,6 +94,7 @@ class ParameterDirection:
     channel: int | None = None
     entry: int | None = None
     partner: str | None = None
+    followers: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -275,7 +277,6 @@ class LossCurvature:
         self.sure = np.zeros(0)
         #: Derivatives (M, N) of all pixels along each direction, by each set of samples. The first set has the weights.
         self.slopes: tuple[Array, Array] = np.zeros((0, 0)), np.zeros((0, 0))
-        self._drawn = 0
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = self._target_noises() if of_target else []
         #: Two samples of the mean effect that the noise of a step's images has on dL/dI (H, W, C), by view; empty if
@@ -333,7 +334,9 @@ class LossCurvature:
         return directions, H, B
 
     def products(self, change: ParameterChange) -> list[dict[str, tuple[Array, Array]]]:
-        """Return two independent samples of the product of H and each direction of a change, by parameter."""
+        """Return two samples of the product of H and each direction of a change, by parameter. All products have the
+        same samples, so they are those of one matrix.
+        """
         found = []
         weighted = [
             [weight * image for weight, image in zip(self._weights, views, strict=True)]
@@ -341,8 +344,7 @@ class LossCurvature:
         ]
         for direction in change.directions:
             one, other = ([_of_channel(image, direction.channel) for image in views] for views in weighted)
-            found.append(self._two_probes(one, other, FIRST_PRODUCT + self._drawn + 1))
-            self._drawn += 2
+            found.append(self._two_probes(one, other, FIRST_PRODUCT))
         return found
 
     def _images(self) -> list[list[Array]]:

@@ -28,12 +28,13 @@ unbiased estimate of the mean of d^2.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from reslrb_cli.statistics import Array, special
+from reslrb_cli.statistics import Array, isotonic_regression, special
 
 #: A distance of this many standard errors is significant; the same for gradients.
 SURE = 2.0
@@ -45,8 +46,8 @@ STEPS_OFF = 3.0
 BLOCKS = 12
 #: One-sided probability that a value is within its limit, and the relative error of the curvature.
 CONFIDENCE, CURVATURE_ERROR = 0.85, 0.3
-#: Minimum number of entries of a group, and maximum number of groups.
-GROUP, MOST_GROUPS = 64, 10
+#: Minimum number of entries of a group that shares its noise, and of a group that shares its curvature.
+GROUP, LEAST_GROUP = 64, 4
 #: Tolerance as a share of a value. Values smaller than this share of the parameter's scale have the tolerance of a
 #: larger value.
 TOLERANCE, LEAST_VALUE = 0.1, 0.4
@@ -150,15 +151,29 @@ class Measured:
         low, high = self.bounds
         return np.clip(to_go, np.minimum(self.value - high, 0), np.maximum(self.value - low, 0)).astype(np.float64)
 
-    def groups(self, kept: Array) -> list[Array]:
-        """Return the indices of the entries in `kept`, in groups whose steps have similar lengths.
+    def groups(self, kept: Array, size: int = GROUP) -> list[Array]:
+        """Return the indices of the entries in `kept`, in groups of at least `size` entries whose steps have similar
+        lengths. The groups are in the order of their steps.
 
         Adam's steps are short where gradients are large. The groups do not depend on `gradients`, so a selection by
         noise cannot bias a group's mean.
         """
         chosen = np.flatnonzero(kept)
         order = chosen[np.argsort(self.step[chosen], kind="stable")]
-        return np.array_split(order, int(np.clip(len(order) // GROUP, 1, MOST_GROUPS))) if order.size else []
+        return np.array_split(order, max(len(order) // size, 1)) if order.size else []
+
+    def groups_of_curvature(self, kept: Array, diagonal: Array) -> list[Array]:
+        """Return the indices of the entries in `kept`, in groups of similar curvature. `diagonal` (N,) are noisy
+        measurements of the curvature.
+
+        The curvature of entries may differ by a factor of thousands, for example at the border of a highlight. The
+        longer the steps of an entry, the smaller its curvature (isotonic regression).
+        """
+        if not (parts := self.groups(kept, LEAST_GROUP)):
+            return []
+        means, counts = [diagonal[part].mean() for part in parts], [part.size for part in parts]
+        blocks = isotonic_regression()(means, weights=counts, increasing=False).blocks
+        return [np.concatenate(parts[first:end]) for first, end in itertools.pairwise(blocks)]
 
 
 @dataclass(frozen=True)

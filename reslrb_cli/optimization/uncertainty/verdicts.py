@@ -41,7 +41,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.optimization.uncertainty.coupling import Maps
+from reslrb_cli.optimization.uncertainty.coupling import Maps, texel_offsets
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.posterior import (
     CURVATURE_ERROR,
@@ -216,9 +216,8 @@ def judge_together(
     if not at:
         return Judged(None, {}, partners)
     chosen = [directions[place] for place in at]
-    rows = [measured[each.key].last for each in chosen]
-    count = min(0 if row is None else len(row) for row in rows)
-    series = [_series(measured[each.key], each, count) for each in chosen]
+    count = min(_recorded(measured, each) for each in chosen)
+    series = [_series(measured, each, count) for each in chosen]
     gradients, offsets = (np.array(part).T for part in zip(*series, strict=True))
     scale = np.array([1.0 if each.entry is None else measured[each.key].prior for each in chosen])
     free = np.ix_(at, at)
@@ -234,15 +233,27 @@ def _is_free(own: Measured, direction: ParameterDirection) -> bool:
     return not held and bool(np.any(own.gradients @ direction.vector))
 
 
-def _series(own: Measured, direction: ParameterDirection, count: int) -> tuple[Array, Array]:
+def _recorded(measured: Mapping[str, Measured], direction: ParameterDirection) -> int:
+    """Return the number of iterations with recorded gradients along a direction."""
+    rows = [measured[direction.key].last, *(measured[key].rows for key in direction.followers)]
+    return min(0 if row is None else len(row) for row in rows)
+
+
+def _series(measured: Mapping[str, Measured], direction: ParameterDirection, count: int) -> tuple[Array, Array]:
     """Return the gradients along a direction, and the distances of their values from the final values. Both have the
     last `count` iterations, and then the gradients at the final values.
     """
+    own = measured[direction.key]
     along = own.gradients @ direction.vector
+    for key, d in direction.followers.items():
+        along = along + measured[key].gradients @ d
     if not count or own.last is None:
         return along, np.zeros(len(along))
     column = direction.entry if direction.entry is not None else direction.channel or 0
     gradients, values = own.last[-count:, 0, column], own.last[-count:, 1, column]
+    for key, d in direction.followers.items():
+        if (rows := measured[key].rows) is not None:
+            gradients = gradients + rows[-count:, 0] @ d
     size = np.linalg.norm(direction.vector) if direction.entry is None else None
     final = own.value[column] if size is None else np.log(size)
     return np.concatenate([gradients, along]), np.concatenate([values - final, np.zeros(len(along))])
@@ -276,13 +287,7 @@ def weigh(
     """
     found, result = judge_together(measured, directions, curvature, fixed, own_curvature), {}
     groups = {key: _groups(own, by_entry[key]) for key, own in measured.items() if key in by_entry}
-    others: dict[str, tuple[Array, str | None]] = {}
-    for each in maps:
-        keys = {key for key, _ in each.names}
-        known = keys & set(by_entry)
-        noise = dict.fromkeys(keys, 0.0) | {key: by_entry[key].mean_of_target(_free(measured[key])) for key in known}
-        left = each.undetermined(measured, noise)
-        others |= {key: (left[key], each.partner(key)) for key in keys}
+    others = _left_by_others(measured, directions, by_entry, found, maps)
     for key, own in measured.items():
         at = [place for place, direction in enumerate(directions) if direction.key == key]
         if at and directions[at[0]].entry is not None:
@@ -294,6 +299,32 @@ def weigh(
         about = result[direction.key]
         if about.verdict == ParameterVerdict.SETTLED.value and found.partners[place] in moving - {direction.key}:
             result[direction.key] = replace(about, verdict=ParameterVerdict.STILL_MOVING.value)
+    return result
+
+
+def _left_by_others(
+    measured: Mapping[str, Measured],
+    directions: Sequence[ParameterDirection],
+    by_entry: Mapping[str, EntryCurvature],
+    found: Judged,
+    maps: Sequence[Maps],
+) -> dict[str, tuple[Array, str | None]]:
+    """Return the mean square offset (N,) of the entries of each texture that images do not determine, because other
+    parameters compensate for it, and the parameter that compensates for most of it.
+    """
+    result: dict[str, tuple[Array, str | None]] = {}
+    for each in maps:
+        keys = {key for key, _ in each.names}
+        known = keys & set(by_entry)
+        noise = dict.fromkeys(keys, 0.0) | {key: by_entry[key].mean_of_target(_free(measured[key])) for key in known}
+        left = each.undetermined(measured, noise)
+        result |= {key: (left[key], each.partner(key)) for key in keys}
+    if found.posterior is not None:
+        spreads = [found.posterior.spread[found.places[place]] if place in found.places else 0.0
+                   for place in range(len(directions))]  # fmt: skip
+        for key, (squares, source) in texel_offsets(directions, spreads).items():
+            by_map, partner = result.get(key, (np.zeros_like(squares), source))
+            result[key] = by_map + squares, source if squares.sum() > by_map.sum() else partner
     return result
 
 
@@ -324,7 +355,7 @@ def _large(
     own: Measured, rows: Sequence[Group], at: Sequence[int], found: Judged, left: Array | None, other: str | None
 ) -> ParameterCertainty:
     """Judge the entries of a large parameter in groups. Another parameter may still compensate for the offset of the
-    whole parameter. The mean square offset `left` (N,) of single entries is undetermined, because the map `other`
+    whole parameter. The mean square offset `left` (N,) of single entries is undetermined, because the parameter `other`
     compensates for it.
     """
     shape, kept = own.value.shape, _free(own)
@@ -417,9 +448,9 @@ def _free(own: Measured) -> Array:
 
 def _groups(own: Measured, by_entry: EntryCurvature) -> list[Group]:
     """Estimate the offsets of the free entries of a large parameter in groups. They are as large as at the start if
-    noise hides the curvature.
+    noise hides the curvature, or if the noise of the gradients exceeds this size.
     """
-    if not (groups := own.groups(_free(own))):
+    if not (groups := own.groups_of_curvature(_free(own), by_entry.diagonal)):
         return []
     inside = np.isin(np.arange(own.value.size), np.concatenate(groups))
     gradients, moved = own.in_blocks
@@ -438,7 +469,8 @@ def _groups(own: Measured, by_entry: EntryCurvature) -> list[Group]:
         halves = [half.mean(axis=0) for half in np.array_split(offsets[:, group], 2)]
         noise = 0.0 if own.rows is None else float(np.mean((halves[0] - halves[1]) ** 2)) / 4
         is_pulled = bool(square > SURE * error and cosine > ON_THE_WAY)
-        found.append(Group(group, square, error, of_target, unknown * own.prior**2, is_pulled, noise))
+        each = Group(group, square, error, of_target, unknown * own.prior**2, is_pulled, noise)
+        found.append(each if each.spread <= own.prior else Group(group, 0.0, 0.0, 0.0, own.prior**2))
     return found
 
 
