@@ -8,6 +8,7 @@ sums over several threads are not reproducible.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import math
@@ -211,9 +212,40 @@ def check(name: str, found: Any) -> None:
     content = json.loads(SAID.read_text())
     if os.environ.get(WRITE) == "write":
         content[name] = found
-        SAID.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+        SAID.write_text(_written(content))
     known = content.get(name)
     assert _rounded(found, known) == known, f"{name} has changed; if intended, run the test with {WRITE}=write"
+
+
+def _written(content: dict[str, Any]) -> str:
+    """Return JSON with one line for each entry of each value."""
+    parts = []
+    for name, value in sorted(content.items()):
+        text = json.dumps(value, sort_keys=True)
+        if isinstance(value, dict):
+            inner = ",\n".join(
+                f"  {json.dumps(key)}: {json.dumps(value[key], sort_keys=True)}" for key in sorted(value)
+            )
+            text = f"{{\n{inner}\n }}"
+        elif isinstance(value, list):
+            text = "[\n" + ",\n".join(f"  {json.dumps(each, sort_keys=True)}" for each in value) + "\n ]"
+        parts.append(f" {json.dumps(name)}: {text}")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def plain(value: Any) -> Any:
+    """Return a value for JSON: records as mappings without None and False, arrays as shape, type, sum and
+    norm, and objects of scenes as ids.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        entries = ((each.name, plain(getattr(value, each.name))) for each in dataclasses.fields(value))
+        return {name: entry for name, entry in entries if entry is not None and entry is not False}
+    if isinstance(value, (list, tuple)):
+        return [plain(each) for each in value]
+    if isinstance(value, np.ndarray):
+        wide = value.astype(np.float64)
+        return [str(value.shape), str(value.dtype), float(wide.sum()), float(np.linalg.norm(wide))]
+    return value.id() if hasattr(value, "class_name") else value
 
 
 def _rounded(found: Any, known: Any) -> Any:
