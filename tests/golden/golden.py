@@ -18,6 +18,8 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ VALUES = Path(__file__).with_name("values.json")
 #: Values of `check`, and the environment variable that makes `check` store them, if its value is `write`.
 SAID, WRITE = Path(__file__).with_name("said.json"), "RESLRB_GOLDEN"
 #: A number with decimals or an exponent. Such numbers may differ by a hundredth, which covers rounding in print.
+isclose = partial(math.isclose, rel_tol=0.01, abs_tol=1e-6)
 _DECIMAL = re.compile(r"(-?\d+\.\d+(?:e[-+]\d+)?|-?\d+e[-+]\d+)")
 SCHEMA = ROOT / "docs" / "config.schema.json"
 #: The smallest settings that still exercise every part of a run. Plain gradient descent hides no bit of the gradients.
@@ -213,8 +216,23 @@ def check(name: str, found: Any) -> None:
     if os.environ.get(WRITE) == "write":
         content[name] = found
         SAID.write_text(_written(content))
-    known = content.get(name)
-    assert _rounded(found, known) == known, f"{name} has changed; if intended, run the test with {WRITE}=write"
+    changed = _differences(found, content.get(name))
+    assert not changed, f"{name} has changed; if intended, run the test with {WRITE}=write\n" + "\n".join(changed[:9])
+
+
+def _differences(found: Any, known: Any, place: str = "") -> list[str]:
+    """Return a line for each difference. Decimals may differ by a hundredth, also within texts."""
+    if isinstance(found, dict) and isinstance(known, dict):
+        pairs = ((found.get(key), known.get(key), f"{place} {key}") for key in dict.fromkeys([*known, *found]))
+        return [line for pair in pairs for line in _differences(*pair)]
+    if isinstance(found, list) and isinstance(known, list):
+        pairs = ((*pair, f"{place} {number}") for number, pair in enumerate(zip_longest(found, known)))
+        return [line for pair in pairs for line in _differences(*pair)]
+    parts, others = (_DECIMAL.split(str(each)) for each in (found, known))
+    is_alike = type(found) is type(known) and parts[::2] == others[::2]
+    if is_alike and all(isclose(float(a), float(b)) for a, b in zip(parts[1::2], others[1::2], strict=True)):
+        return []
+    return [f"{place}: {found!r} was {known!r}"]
 
 
 def _written(content: dict[str, Any]) -> str:
@@ -246,24 +264,6 @@ def plain(value: Any) -> Any:
         wide = value.astype(np.float64)
         return [str(value.shape), str(value.dtype), float(wide.sum()), float(np.linalg.norm(wide))]
     return value.id() if hasattr(value, "class_name") else value
-
-
-def _rounded(found: Any, known: Any) -> Any:
-    """Return `found` with the decimals of `known` in place of those that differ by less than a hundredth."""
-    if isinstance(found, dict) and isinstance(known, dict):
-        return {key: _rounded(value, known.get(key)) for key, value in found.items()}
-    if isinstance(found, list) and isinstance(known, list):
-        return [_rounded(*pair) for pair in zip(found, known, strict=False)] + found[len(known) :]
-    if isinstance(found, str) and isinstance(known, str):
-        parts, others = _DECIMAL.split(found), _DECIMAL.split(known)
-        if parts[::2] == others[::2]:
-            return "".join(
-                other if place % 2 and math.isclose(float(part), float(other), rel_tol=0.01) else part
-                for place, (part, other) in enumerate(zip(parts, others, strict=True))
-            )
-    if isinstance(found, float) and isinstance(known, (int, float)) and math.isclose(found, known, rel_tol=0.01):
-        return known
-    return found
 
 
 def texts() -> dict[str, str]:

@@ -1,0 +1,204 @@
+"""Everything that runs, sweeps, searches and loggers write (`golden.check`), but for times."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli import tiny
+from cli.tiny import reslrb, settings
+from golden import golden
+from kit import work_in
+from records.test_metrics import make_record
+
+from reslrb_cli.cli import sweep
+from reslrb_cli.errors import ExitCode
+from reslrb_cli.records.manifest import PROGRAM, Status
+from reslrb_cli.runs import loggers, recorder
+from reslrb_cli.runs.callbacks import RunInfo
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+#: Entries that differ between machines or runs, and times in text.
+OTHERS = {"step_ms", "codegen_ms", "elapsed_s", "first_s", "peak_mib", "curvature_s", "at", "started", "ended", "process",
+          "device", "platform", "versions", "commit", "written", "seconds", "program", "files", "codes",
+          "command_line", "command"}  # fmt: skip
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT[\d:+]+|\b\d+\.\d+ s\b|\b\d+ MiB\b")
+
+
+def masked(value: Any, folder: Path) -> Any:
+    """Return a value of JSON without what differs between machines or runs."""
+    if isinstance(value, dict):
+        return {key: "..." if key in OTHERS else masked(each, folder) for key, each in value.items()}
+    if isinstance(value, list):
+        return [masked(each, folder) for each in value]
+    return _TIME.sub("...", value.replace(str(folder), "HERE")) if isinstance(value, str) else value
+
+
+def content(file: Path, folder: Path) -> Any:
+    """Return the content of a file for comparison."""
+    if file.suffix == ".npz":
+        with np.load(file) as arrays:
+            found = {name: golden.plain(arrays[name]) for name in arrays.files if name != "state"}
+            state = json.loads(arrays["state"].tobytes()) if "state" in arrays else None
+        return masked(found | ({} if state is None else {"state": state}), folder)
+    if file.suffix in (".exr", ".png"):
+        return golden.plain(np.array(mi.Bitmap(str(file))))
+    if file.suffix == ".npy":
+        return golden.plain(np.load(file))
+    text = file.read_text()
+    if file.suffix == ".json":
+        return masked(json.loads(text), folder)
+    if file.suffix == ".jsonl":
+        return [json.dumps(masked(json.loads(line), folder)) for line in text.splitlines()]
+    return masked(text.splitlines(), folder) if file.suffix in (".yaml", ".log", ".xml") else "text"
+
+
+def check(name: str, folder: Path, *words: str, root: str = "runs") -> None:
+    """Run a command, and check its exit code, its output and all files below `root` that changed."""
+    before = {file: file.stat().st_mtime_ns for file in Path(root).rglob("*") if file.is_file()}
+    result = reslrb(*words)
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("variant ")]
+    found = {"code": result.exit_code, "out": masked(result.stdout.splitlines(), folder), "err": masked(lines, folder)}
+    for file in sorted(Path(root).rglob("*")):
+        if file.is_symlink():
+            found[str(file)] = f"link to {file.readlink()}"
+        elif file.is_file() and before.get(file) != file.stat().st_mtime_ns:
+            found[str(file)] = content(file, folder) if file.suffix != ".yaml" or "search" not in name else "text"
+    golden.check(name, found)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Working directory with the tiny experiment from three sensors. Pages are not drawn."""
+    tiny.write_experiment(tmp_path, tiny.scene_seen(*tiny.EYES, rfilter="gaussian"))
+    work_in(tmp_path, monkeypatch)
+    monkeypatch.setattr(recorder, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
+    return tmp_path
+
+
+#: Two parameters of different kinds, three views of which one is held out, a regularizer, and a bound.
+RICH = settings(
+    f"parameters=[{{key: {tiny.KEY}, initial: 0.5, bounds: [0, 1], "
+    "regularizers: [{type: total_variation, weight: 0.01}]}, "
+    "{key: lamp.emitter.radiance.value, initial: [3, 4, 5], bounds: [0, 20]}]",
+    "views=[{sensor: 0}, {sensor: 1, exposure: 2}, {sensor: 2}]", "run.held_out=[2]", "run.iterations=4",
+    "run.checkpoint_every={iterations: 1}", "run.certainty=false", "run.final_spp=4", "target.render.spp=4",
+)  # fmt: skip
+
+
+def test_a_run_that_is_interrupted_and_continued(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    records = recorder.Recording.records
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder.Recording, "records", lambda self, stop: records(self, lambda: self.done == 2))
+        check("run that is interrupted", folder, "optimize", "tiny.yaml", *RICH)
+    check("run that goes on", folder, "optimize", "--resume", "runs/tiny", *settings("run.iterations=3"))
+    check("run that is done", folder, "optimize", "--resume", "runs/tiny")
+
+
+# Sweeps and searches of pretended runs.
+
+
+def pretend(ends: dict[str, tuple[int, str]], told: list[Any]) -> Any:
+    """Return a replacement of `jobs.call`. `ends` has the exit code and the line of runs that do not finish."""
+
+    def call(arguments: list[str], interrupts: Any, slot: Any = None, fresh: bool = False) -> tuple[int, str]:
+        sets = dict(word.partition("=")[::2] for word in arguments if word.startswith("run."))
+        name = json.loads(sets["run.name"]) if sets else Path(arguments[2]).name
+        told.append([*arguments, fresh])
+        code, line = next((end for part, end in ends.items() if part in name), (0, "finished"))
+        run = Path("s") / name
+        run.mkdir(exist_ok=True)
+        digits = [float(number) for number in re.findall(r"\d+\.?\d*", name)]
+        results = {
+            "iterations": 3,
+            "elapsed_s": 1.5,
+            "image_loss": {"final": sum(digits)},
+            "rmse": {"final": digits[0]},
+        }
+        status = Status.FINISHED if code == 0 else Status.FAILED
+        content = {"program": PROGRAM, "status": status, "results": results, "error": None if code == 0 else line}
+        (run / "manifest.json").write_text(json.dumps(content))
+        interrupts.requested |= code == ExitCode.INTERRUPTED
+        return code, line
+
+    return call
+
+
+SEARCH = ("--search", "optuna", "--trials", "3", "--vary", "optimizer.learning_rate={low: 0.01, high: 0.3, log: true}",
+          "--vary", "run.spp={low: 2, high: 40}", "--vary", "optimizer.type=[adam, sgd]")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "ends", "again"),
+    [
+        ("sweep", ("--vary", "run.spp=[4, 8]", "--seeds", "2"), {}, ("--seeds", "3")),
+        ("sweep with a failure", ("--vary", "run.spp=[4, 8]"), {"spp=8": (5, "loss is nan")}, ()),
+        ("sweep that is interrupted", ("--vary", "run.spp=[4, 8, 6]"), {"spp=8": (130, "interrupted")}, ()),
+        ("sweep without a backend", (), {"seed": (3, "no libLLVM")}, ()),
+        ("sweep on a full disk", ("--vary", "run.max_seconds=[2]"), {"seed": (6, "s/x: the disk is full")}, ()),
+        ("search", (*SEARCH, "--seeds", "2"), {}, ("--trials", "4")),
+        ("search with a failure", SEARCH, {"spp=21": (5, "loss is nan")}, ()),
+        ("search that fails", SEARCH, {"type": (5, "loss is nan")}, ()),
+    ],
+)  # fmt: skip
+def test_sweeps(
+    name: str, words: tuple[str, ...], ends: Any, again: tuple[str, ...], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "--search" in words:
+        pytest.importorskip("optuna")
+    told: list[Any] = []
+    monkeypatch.setattr(sweep, "call", pretend(ends, told))
+    check(name, folder, "sweep", "tiny.yaml", *words, "-o", "s", root="s")
+    monkeypatch.setattr(sweep, "call", pretend({}, told))
+    check(f"{name}, again", folder, "sweep", "--resume", "s", *again, root="s")
+    golden.check(f"{name}, calls", masked(told, folder))
+
+
+# Loggers, with packages that only remember their calls.
+
+
+def remembered(value: Any) -> Any:
+    """Return arguments of a call for comparison."""
+    if isinstance(value, dict):
+        return {str(key): remembered(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [remembered(each) for each in value]
+    return golden.plain(value) if isinstance(value, (int, float, str, np.ndarray, type(None))) else "..."
+
+
+@pytest.mark.parametrize("status", ["finished", "interrupted", "failed"])
+@pytest.mark.parametrize("active", [False, True])
+@pytest.mark.parametrize("name", loggers.LOGGERS)
+def test_loggers(name: str, active: bool, status: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = MagicMock()
+    fake.run = fake.active if active else None
+    fake.active_run.return_value = fake.active if active else None
+    monkeypatch.setattr(loggers, "package", lambda *_: fake)
+    monkeypatch.setattr(loggers, "time", SimpleNamespace(time=lambda: 12.5))
+    monkeypatch.setenv("WANDB_PROJECT", "mine")
+    logger = loggers.LOGGERS[name]()
+    values = {"a": np.float32([0.1, 0.2, 0.3]), "b": np.float32(2), "c": np.float32(range(5)),
+              "slab.heightmap": np.float32([[[1], [3]]]), "d.data": np.full((2, 2, 3), 0.25, np.float32)}  # fmt: skip
+    long = {"run.spp": 4, "a(b)": "x" * 7000}
+    for done in (0, 3):
+        shapes = {key: value.shape for key, value in values.items()}
+        run = RunInfo("mine", tmp_path / "runs/tiny", long, 9, done, shapes, values.__getitem__)
+        logger.begin(run)
+        logger.image(run, "target-1", np.full((2, 3, 3), 0.1, np.float32), 2.0)
+        logger.iteration(
+            run, make_record(iteration=done, parameter_rmse=0.5, parameter_errors={"a": 0.1}, held_out=0.2)
+        )
+        logger.image(run, "final", np.full((2, 3, 1), 0.1, np.float32), 1.0)
+        logger.end(run, status)
+    calls = [f"{call[0]} {json.dumps(remembered([call[1], call[2]]))}" for call in fake.mock_calls]
+    golden.check(f"{name}, {active}, {status}", masked([re.sub("x{20,}", lambda m: f"x * {len(m[0])}", each)
+                                                        for each in calls], tmp_path))  # fmt: skip
