@@ -9,8 +9,6 @@ import signal
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from cli.tiny import ended, measured
@@ -124,24 +122,6 @@ def test_a_tag_selects_its_cases(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert "there is no case `furnace`" in capsys.readouterr().err
 
 
-def test_a_suite_names_its_open_cases(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    from reslrb_cli.measure import extreme
-
-    def pretended(name: str, *_others: object) -> Iterator[GradcheckRecord]:
-        row = {"case": name, "parameter": "a.value", "label": "reslrb:stack", "options": {}, "seeds": 8}
-        row |= {"reference": Reference.PRB, "kind": Kind.EXPECTATION}
-        yield GradcheckRecord(**row, verdict=Verdict.HOLDS)
-        if name != "held":
-            yield GradcheckRecord(**row, verdict=Verdict.UNRESOLVED, message="is noisy")
-
-    monkeypatch.setattr(extreme, "run_case", pretended)
-    monkeypatch.setattr(extreme, "CASES", {name: name for name in ("held", "first", "second")})
-    assert call("--suite", "extreme") == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-2] == "3 of 5 comparisons hold, 0 fail, 2 leave the question open"
-    assert lines[-1] == "open in first, second: a.value: reslrb:stack against prb: is noisy"
-
-
 def test_ctrl_c_prints_finished_comparisons(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,25 +134,3 @@ def test_ctrl_c_prints_finished_comparisons(
     assert call(*SMALL, "--seeds", "8", "--integrators", "reslrb:stack") == 130
     *_, last = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"open: .* 1 of 8 seeds are too few .*", last)
-
-
-def test_a_budget_too_small_for_anything_is_no_success(capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(*SMALL, "--budget", "0", "--integrators", "reslrb:stack") == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-2] == "0 of 6 comparisons hold, 0 fail, 6 leave the question open"
-    assert lines[-1] == "open: 6 not measured: the budget was spent; allow more with --budget"
-
-
-@pytest.mark.parametrize(
-    ("holds", "end"),
-    [
-        ((True, True), "2 of 2  holds"),
-        ((True, None), "1 of 2, 1 open  holds"),
-        ((None, False), "0 of 2, 1 open  FAILS"),
-    ],
-)
-def test_a_case_holds_unless_a_comparison_fails(holds: tuple[bool | None, ...], end: str) -> None:
-    rows: list[Any] = [
-        SimpleNamespace(holds=each, z_max=None, relative_l2=None, relative_l2_limit=None) for each in holds
-    ]
-    assert gradcheck._case_line("furnace", rows).endswith(end)

@@ -16,8 +16,7 @@ from reslrb_cli.measure.bench import Bench
 from reslrb_cli.measure.engine import NO_TIME
 from reslrb_cli.measure.methods import BENCH_ROUNDS, MeasurementPlan, bench_plan, depths, parse_cases, sample_counts
 from reslrb_cli.measure.processes import CannotStart, Stopped
-from reslrb_cli.records.measurements import BenchRecord, BenchStatus, Spread
-from reslrb_cli.report.tables import bench_cells, bench_columns
+from reslrb_cli.records.measurements import BenchRecord, BenchStatus
 
 # The order of a sweep, and the handling of cases that end. The processes only pretend to measure.
 
@@ -66,53 +65,27 @@ def test_steps_are_interleaved_in_rotating_order() -> None:
     assert Pretended.log == warm + rounds
 
 
-def test_records() -> None:
-    rows = run(sweep())
-    assert [(row.method.label, row.method.max_depth) for row in rows] == [
-        (name, depth) for depth in (2, 4) for name in LIST.split(",")
-    ]
-    stack = rows[1]
-    options = [stack.method.options[name] for name in ("type", "estimator", "rr_depth")]
-    assert (options, stack.method.spp) == (["reslrb", "stack", 7], 4)
-    assert (stack.width, stack.height, stack.texels, stack.status, stack.repeats) == (6, 5, 9, BenchStatus.OK, 3)
-    assert stack.step_ms == Spread(20.0, 12.0, 28.0)
-    assert stack.kernel_ms == Spread(10.0, 6.0, 14.0)
-    assert (stack.codegen_ms, stack.tracing_ms) == (Spread(2.5, 1.5, 3.5), Spread(7.5, 4.5, 10.5))
-    assert (stack.cold_ms, stack.peak_mib, stack.scratch_bytes) == (4.0, 1.5, 60)
-    assert stack.step_ratio == stack.kernel_ratio == Spread(0.5, 0.5, 0.5)  # taken in pairs, because all slow down
-    assert rows[0].step_ratio == Spread(1.0, 1.0, 1.0)
-
-
+@pytest.mark.parametrize("ended", [["walk_ad"], ["ptracer"], ["ptracer", "reslrb", "walk_ad"]], ids=len)
 @pytest.mark.parametrize("question", [0, 1, 2, 5], ids=["loading", "cold", "warming up", "in a round"])
-def test_an_ended_case_is_recorded_and_the_rest_continues(question: int) -> None:
-    Pretended.ends = {("walk_ad", 2): question}
+def test_ended_cases_are_recorded_and_the_rest_continues(ended: list[str], question: int) -> None:
+    """The cases are tried again at the next depth. Without a baseline, there are no ratios."""
+    Pretended.ends = {(name, 2): question for name in ended}
     rows = run(sweep())
-    ended = rows[2]
-    assert (ended.status, ended.repeats, ended.width) == (BenchStatus.OUT_OF_MEMORY, 0, 6)
-    measured = (ended.step_ms, ended.kernel_ms, ended.cold_ms, ended.peak_mib, ended.scratch_bytes)
-    assert measured == (None,) * 5
-    assert (ended.message, ended.step_ratio) == ("ended by SIGSEGV", None)
-    assert [row.repeats for row in rows] == [3, 3, 0, 3, 3, 3]
-    assert rows[5].status is BenchStatus.OK  # the case is tried again at the next depth
-
-
-@pytest.mark.parametrize("question", [1, 5], ids=["cold", "in a round"])
-def test_without_a_baseline_there_are_no_ratios(question: int) -> None:
-    Pretended.ends = {("ptracer", 2): question}
-    rows = run(sweep())
-    assert [row.step_ratio is None for row in rows] == [True, True, True, False, False, False]
+    assert [row.method.label for row in rows] == [*LIST.split(","), *LIST.split(",")]
+    for row in rows:
+        at_first = row.method.max_depth == 2
+        has_ended = at_first and row.method.options["type"] in ended
+        assert row.status is (BenchStatus.OUT_OF_MEMORY if has_ended else BenchStatus.OK)
+        assert (row.message, row.repeats) == (("ended by SIGSEGV", 0) if has_ended else ("", 3))
+        figures = (row.step_ms, row.kernel_ms, row.cold_ms, row.peak_mib, row.scratch_bytes)
+        assert {figure is None for figure in figures} == {has_ended}
+        assert (row.step_ratio is None) == (has_ended or (at_first and "ptracer" in ended))
+        assert row.width == (None if at_first and len(ended) == 3 and question == 0 else 6)
 
 
 @pytest.mark.parametrize("cases", ["reslrb:stack,reslrb:event", "reslrb:event,ptracer"])
 def test_times_are_relative_to_ptracer_or_the_first_case(cases: str) -> None:
     assert sweep(cases).baseline.label == ("ptracer" if "ptracer" in cases else "reslrb:stack")
-
-
-@pytest.mark.parametrize(("question", "width"), [(0, None), (1, 6)], ids=["loading", "cold"])
-def test_all_cases_may_end(question: int, width: int | None) -> None:
-    Pretended.ends = {(name, 2): question for name in ("ptracer", "reslrb", "walk_ad")}
-    found = {(row.status, row.width) for row in run(sweep(values=[2]))}
-    assert found == {(BenchStatus.OUT_OF_MEMORY, width)}
 
 
 @pytest.mark.parametrize(("after", "kept"), [(5, []), (14, [1, 1, 1]), (13, [1, 1]), (33, [3, 3, 3, 1])])
@@ -265,18 +238,6 @@ def test_the_sample_count_varies_and_the_depth_stays() -> None:
     rows, said = run_swept([2, 8])
     assert said == []
     assert [(row.method.spp, row.method.max_depth, row.width) for row in rows] == [(2, 5, 6)] * 3 + [(8, 5, 6)] * 3
-
-
-def test_the_table_starts_with_the_varied_quantity() -> None:
-    Pretended.ends = {("walk_ad", 5): 2}
-    rows, _ = run_swept([16, 128])
-    labels = LIST.split(",")
-    table = bench_columns(labels, "spp")
-    assert table.head().split()[:2] == ["spp", "step"]
-    lines = [table.line(bench_cells(row, row.method.spp)) for row in rows]
-    assert [line.split()[:2] for line in lines] == [[str(spp), name] for spp in (16, 128) for name in labels]
-    assert lines[2].endswith("out_of_memory")
-    assert {row.status for row in rows} == {BenchStatus.OK, BenchStatus.OUT_OF_MEMORY}
 
 
 def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:

@@ -22,7 +22,7 @@ from reslrb_cli.measure.methods import DEFAULTS, IMAGES, parse_cases
 from reslrb_cli.measure.steps import Sampler, survey
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.measurements import BenchStatus, Method, MethodRecord, Range
-from reslrb_cli.report.tables import closing_sentence, method_cells, method_columns, notes
+from reslrb_cli.report.tables import closing_sentence, notes
 
 # What `convergence` reports about methods of known cost, noise and bias. The processes only pretend to measure.
 
@@ -378,16 +378,6 @@ def test_times_prevented_by_a_bias() -> None:
     assert samples.seconds_to(0.9 * size, biased=False)[0] is not None
     seconds, _ = samples.seconds_to(2 * size, biased=True)
     assert seconds == pytest.approx(samples.variance / (3 * size**2) * samples.step_s)
-
-
-def test_figures_of_the_table_are_fields_of_the_record() -> None:
-    figures = ("step s", "steps", "error", "slope", "efficiency", "max |z| (limit)", "s to 10%", "s to 3%", "s to 1%")
-    assert method_columns([], []).titles == ("", "parameter", *figures)
-    record = MethodRecord(
-        method=METHOD, parameter="a", status=BenchStatus.OK, step_s=0.5, repeats=12000, relative_rmse=0.1, slope=-0.5,
-        efficiency=Range(2, 1, 3), bias_z=1.5, bias_z_limit=4.5,
-    )  # fmt: skip
-    assert method_cells(record)[2:8] == ("0.5", "12000", "0.1", "-0.5", "2.0 [1.0, 3.0]", "1.5 (4.5) open")
 
 
 def test_too_few_steps_have_no_intervals() -> None:

@@ -85,18 +85,6 @@ def test_an_ended_method_is_recorded_and_the_rest_continues() -> None:
     assert said.count("old") == 1
 
 
-def test_too_few_rounds_are_no_spent_budget() -> None:
-    _, results, _ = play(Stage(), plan(rounds=2))
-    assert {record.message for record in results.methods} == {"results need 3 rounds; set --rounds"}
-
-
-def test_an_end_during_compilation_is_reported() -> None:
-    stage = Stage(case_reslrb_stack=Pretence(ends=1))
-    _, results, said = play(stage, plan())
-    assert "reslrb:stack: out_of_memory: ended by SIGKILL" in said
-    assert of(results, "reslrb:stack").status is BenchStatus.OUT_OF_MEMORY
-
-
 def test_without_a_reference_there_are_no_errors() -> None:
     _, results, said = play(Stage(reference_reslrb_stack=Pretence(ends=1)), plan())
     assert "reslrb:stack: out_of_memory: ended by SIGKILL" in said
