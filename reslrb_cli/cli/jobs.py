@@ -13,22 +13,19 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from typing import IO
 
 import click
 
 from reslrb_cli.backend.doctor import ask_gpu, free_bytes
 from reslrb_cli.backend.installation import python_command
 from reslrb_cli.cli.terminal import Interrupts
-from reslrb_cli.config.files import tail
 from reslrb_cli.errors import ExitCode
-from reslrb_cli.measure.processes import last_words, memory_of
+from reslrb_cli.measure.processes import Child, last_words
 from reslrb_cli.report.format import shorten
 
 #: Maximum wait, in seconds, for the end of runs that must end at once.
@@ -171,41 +168,27 @@ def call(arguments: Sequence[str], interrupts: Interrupts, slot: RunSlot, fresh:
     `fresh` process has no cached kernels or decisions. Runs with equal time limits therefore start under equal
     conditions.
     """
-    environment = dict(os.environ) | ({GPUS: slot.gpu} if slot.gpu else {})
-    with (
-        tempfile.TemporaryDirectory(prefix="reslrb-sweep-", ignore_cleanup_errors=True) as folder,
-        tempfile.TemporaryFile() as output,
-    ):
-        if fresh:
-            environment |= dict.fromkeys(("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE"), folder)
-            environment["CUDA_CACHE_DISABLE"] = "1"
-        process = slot.process = subprocess.Popen(
-            [*python_command(_PROGRAM), *arguments],
-            stdin=subprocess.PIPE,  # closes when this process ends
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            env=environment,
-        )
-        told, code = False, None
-        try:
-            while code is None:
-                if (interrupts.requested or slot.must_end) and not told:
-                    process.terminate()
-                    told = True
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    code = process.wait(_POLL_SECONDS)
-                slot.line = next(filter(_PROGRESS.match, reversed(_last_lines(output))), "")
-                slot.resident, slot.peak = (memory_of(process.pid, name) for name in ("VmRSS", "VmHWM"))
-                slot.show()
-        finally:
-            slot.process, slot.line = None, ""
+    child = Child(
+        [*python_command(_PROGRAM), *arguments], {GPUS: slot.gpu} if slot.gpu else {}, fresh,
+        stdin=subprocess.PIPE,  # closes when this process ends
+    )  # fmt: skip
+    process = slot.process = child.process
+    told, code = False, None
+    try:
+        while code is None:
+            if (interrupts.requested or slot.must_end) and not told:
+                process.terminate()
+                told = True
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                code = process.wait(_POLL_SECONDS)
+            slot.line = next(filter(_PROGRESS.match, reversed(_last_lines(child))), "")
+            slot.resident, slot.peak = child.memory("VmRSS"), child.memory("VmHWM")
             slot.show()
-            process.kill()
-            process.wait()
-            if process.stdin is not None:
-                process.stdin.close()
-        said = _last_lines(output)
+        said = _last_lines(child)
+    finally:
+        slot.process, slot.line = None, ""
+        slot.show()
+        child.close()
     if code < 0:
         name = signal.Signals(-code).name
         memory = " (often sent when memory runs out)" if -code == signal.SIGKILL else ""
@@ -213,9 +196,9 @@ def call(arguments: Sequence[str], interrupts: Interrupts, slot: RunSlot, fresh:
     return code, said[-1] if said else f"ended with exit code {code}, without a message"
 
 
-def _last_lines(output: IO[bytes]) -> list[str]:
-    """Return the last lines of a run's `output`."""
-    return [line for line in tail(output, MOST_BYTES).decode(errors="replace").splitlines() if line.strip()]
+def _last_lines(child: Child) -> list[str]:
+    """Return the last lines of a run's output."""
+    return [line for line in child.tail(MOST_BYTES).splitlines() if line.strip()]
 
 
 def follow() -> None:

@@ -314,7 +314,9 @@ def compare_expectations(
     independent = min(effective_entries(side[:, noisy]) for side in sides) if noisy.any() else 1.0
     z_max, z_rms = float(np.abs(z).max()), combined_z_rms(z[noisy])
     rms_limit = family.z_rms_limit(independent)
-    detectable = _smallest(deviation.detectable(family.z_max_limit) + bias, expected)
+    # The smallest relative error of the whole gradient that the most sensitive entry would detect.
+    needed, seen = deviation.detectable(family.z_max_limit) + bias, np.abs(expected) > 0
+    detectable = float((needed[seen] / np.abs(expected[seen])).min()) if seen.any() else np.inf
     counts = deviation.var > np.maximum(NOISY * floor, bias / NOISY) ** 2
     heavy = any(tail_weight(side[:, counts]) > TAIL for side in sides)
     few = len(ours) < TAIL_SEEDS
@@ -401,14 +403,6 @@ def _entries(
             break
     whole = overall(ours), overall(reference)
     return np.concatenate([a, whole[0]], 1), np.concatenate([b, whole[1]], 1)
-
-
-def _smallest(needed: np.ndarray, expected: np.ndarray) -> float:
-    """Return the smallest relative error of the whole gradient that the most sensitive entry would detect. An entry
-    detects the deviation `needed`.
-    """
-    seen = np.abs(expected) > 0
-    return float((needed[seen] / np.abs(expected[seen])).min()) if seen.any() else np.inf
 
 
 def _problem(ours: np.ndarray, reference: np.ndarray) -> Comparison | None:

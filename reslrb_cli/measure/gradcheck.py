@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from reslrb_cli.config.integrators import PLAIN
-from reslrb_cli.config.schema import Config
 from reslrb_cli.estimators import ESTIMATORS
 from reslrb_cli.measure.comparison import (
     ROUNDING,
@@ -97,7 +96,12 @@ class Gradcheck:
         shown += [(listed.label, parts.ways[listed.label]) for listed in parts.listed if listed.type == "custom"]
         images = [(label, way, parts.images[way][0]) for label, way in shown]
         found = [Row(None, label, one, Kind.IMAGE, way) for label, way, one in images if one is not None]
-        plain = [label for label, config in self.settings.configs.items() if _draws_plainly(config)]
+        # With guiding, a quasi-random sequence or measured pixels, paths differ from those of naive AD at equal seeds.
+        drawn, options = (
+            ("guiding", "sequence", "pixels"),
+            {label: config.integrator.options() for label, config in self.settings.configs.items()},
+        )
+        plain = [label for label, own in options.items() if all(own.get(n, PLAIN[n]) == PLAIN[n] for n in drawn)]
         for key in parts.case.keys:
             for listed in parts.listed:
                 ours = listed.type == "reslrb" and listed.label in plain
@@ -275,11 +279,3 @@ class Gradcheck:
         ]  # fmt: skip
         for row, why in rows:
             yield self._record(row, Comparison(Verdict.NO_REFERENCE, message=why), 0)
-
-
-def _draws_plainly(config: Config) -> bool:
-    """True if an integrator's paths equal the paths of naive AD at equal seeds. Guiding, a quasi-random sequence and
-    `pixels: measured` make the paths differ.
-    """
-    options = config.integrator.options()
-    return all(options.get(name, PLAIN[name]) == PLAIN[name] for name in ("guiding", "sequence", "pixels"))

@@ -302,19 +302,14 @@ class Case:
         """Return the gradient of `leaves` from one step, as a flat array, and clear it. The scene has the `leaves`."""
         objective = objective or self.objective
         step(integrator, self.scene, self.sensor, objective, seed=seed, spp=spp, params=self.params, **options)
-        self._note_rounding(spp)
+        if mi.is_spectral and isinstance(self.values, Selection):  # before the gradients are collected
+            sums = dr.prod(self.weights.shape[:2]) * spp / PACKET
+            for key, condition in self.values.colours.cancellation().items():
+                self.roundings[key] = max(self.rounding(key), 2.0**-24 * np.sqrt(sums) * condition)
         self.values.collect()
         result = [np.array(dr.grad(leaf), dtype=np.float64).ravel() for leaf in leaves.values()]
         dr.clear_grad(leaves)
         return np.concatenate(result)
-
-    def _note_rounding(self, spp: int) -> None:
-        """Store the rounding errors of the gradients by colours. Called before the gradients are collected."""
-        if not mi.is_spectral or not isinstance(self.values, Selection):
-            return
-        sums = dr.prod(self.weights.shape[:2]) * spp / PACKET
-        for key, condition in self.values.colours.cancellation().items():
-            self.roundings[key] = max(self.rounding(key), 2.0**-24 * np.sqrt(sums) * condition)
 
     def rounding(self, key: str | None = None) -> float:
         """Return the relative error of single precision in the gradients so far by the parameter `key`, or by all.

@@ -217,11 +217,6 @@ def sample_counts(spp: int) -> list[int]:
     return sorted({max(round(share * spp), 1) for share in SHARES})
 
 
-def with_run(config: Config, **changes: Any) -> Config:
-    """Return the experiment with other settings of `run`."""
-    return config.model_copy(update={"run": config.run.model_copy(update=changes)})
-
-
 #: Integrators that `bench` compares by default.
 BENCHED = "ptracer,reslrb:reservoir,reslrb:event,reslrb:gather,reslrb:stack,trajectory"
 
@@ -317,9 +312,10 @@ class MeasurementPlan:
 
     def at(self, case: NamedIntegrator, value: int) -> Config:
         """Return the experiment of one case at one value. Raises ConfigError."""
-        config = with_run(self.config, spp=value) if self.swept == "spp" else self.config
-        depth = value if self.swept == "depth" else config.integrator.max_depth
-        return case.at(config, depth, known=self.quantity != "loss")
+        config, depth = self.config, self.config.integrator.max_depth
+        if self.swept == "spp":
+            config = config.model_copy(update={"run": config.run.model_copy(update={"spp": value})})
+        return case.at(config, value if self.swept == "depth" else depth, known=self.quantity != "loss")
 
     def of_reference(self, case: NamedIntegrator) -> Config:
         """Return the experiment of a reference, which has known dL/dI. Raises ConfigError."""

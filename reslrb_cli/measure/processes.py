@@ -1,8 +1,8 @@
-"""Worker processes that take measurements, from outside (`Process`) and from inside (`run`).
+"""Child processes (`Child`), and workers that take measurements, from outside (`Process`) and from inside (`run`).
 
 `Process` and `run` exchange dictionaries over a connection. The first one describes the case. The worker answers when
-the case is loaded. Each later one is a question. The output of a worker goes to a file, whose last lines explain a
-crash. The end of a worker is detected and reported, and does not end the measurement.
+the case is loaded. Each later one is a question. The last lines of a worker's output explain a crash. The end of a
+worker is detected and reported, and does not end the measurement.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
 
 from reslrb_cli.backend.doctor import of_system
+from reslrb_cli.config.files import tail
 from reslrb_cli.errors import BackendError, ConfigError, ReslrbError, is_out_of_memory, mentions_memory
 from reslrb_cli.records.measurements import BenchStatus
 
@@ -59,7 +60,55 @@ class CannotStart(ReslrbError):
         self.exit_code = exit_code  # type: ignore[assignment]
 
 
-class Process:
+#: Environment variables with the folders of caches, which a `fresh` process does not share.
+CACHES = ("DRJIT_CACHE_DIR", "OPTIX_CACHE_PATH", "RESLRB_CACHE")
+
+
+class Child:
+    """A child process in its own session, so that only this process handles Ctrl-C.
+
+    Its output goes to a file in a temporary folder. `environment` has further variables. A `fresh` process has no
+    cached kernels or decisions. `options` are those of `subprocess.Popen`.
+    """
+
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str] = {}, fresh: bool = False, **options: Any
+    ) -> None:
+        with _making:
+            self._folder = tempfile.TemporaryDirectory(prefix="reslrb-", ignore_cleanup_errors=True)
+            caches = dict.fromkeys(CACHES, self._folder.name) | {"CUDA_CACHE_DISABLE": "1"} if fresh else {}
+            self._output = Path(self._folder.name, "output")
+            with self._output.open("wb") as output:
+                self.process = subprocess.Popen(
+                    command, stdout=output, stderr=output, start_new_session=True,
+                    env={**os.environ, **environment, **caches}, **options,
+                )  # fmt: skip
+            _at_work.append(self)
+
+    def tail(self, most: int) -> str:
+        """Return the end of the output, at most `most` bytes."""
+        with self._output.open("rb") as output:
+            return tail(output, most).decode(errors="replace")
+
+    def memory(self, kind: str) -> int:
+        """Return the memory of the process in bytes, or 0 if it is unknown. `kind` is as in /proc: `VmRSS` is the
+        memory now, `VmHWM` the largest so far, and `VmPeak` the largest address space.
+        """
+        found = of_system(f"/proc/{self.process.pid}/status", kind)
+        return int(found.removesuffix(" kB")) * 1024 if found else 0
+
+    def close(self) -> None:
+        """End the process and remove its files."""
+        self.process.kill()
+        self.process.wait()
+        if self.process.stdin is not None:
+            self.process.stdin.close()
+        self._folder.cleanup()
+        if self in _at_work:
+            _at_work.remove(self)
+
+
+class Process(Child):
     """One worker. `first` is the first message to the worker, including `memory_limit` (bytes, or None).
 
     The command gets the descriptor of the worker's connection as its last argument.
@@ -69,20 +118,10 @@ class Process:
         self.limit: int | None = first["memory_limit"]
         self.peak_bytes = 0  # of address space
         self._connection, theirs = Pipe()
-        with _making, theirs:
-            self._folder = tempfile.TemporaryDirectory(prefix="reslrb-bench-", ignore_cleanup_errors=True)
-            self._words = Path(self._folder.name) / "output"
-            with self._words.open("wb") as words:
-                self._process = subprocess.Popen(
-                    [*command, str(theirs.fileno())],
-                    stdin=subprocess.DEVNULL,
-                    stdout=words,
-                    stderr=words,
-                    pass_fds=[theirs.fileno()],
-                    start_new_session=True,  # only this process handles Ctrl-C
-                )
-            _at_work.append(self)
-        self.ask(first | {"cache": self._folder.name})
+        with theirs:
+            place = theirs.fileno()
+            super().__init__([*command, str(place)], fresh=True, stdin=subprocess.DEVNULL, pass_fds=[place])
+        self.ask(first)
 
     def ask(self, question: dict[str, Any]) -> None:
         """Send a message. `answer` reports if the process has ended."""
@@ -94,7 +133,7 @@ class Process:
         while True:
             if stop():
                 raise Stopped
-            self.peak_bytes = max(self.peak_bytes, memory_of(self._process.pid, "VmPeak"))
+            self.peak_bytes = max(self.peak_bytes, self.memory("VmPeak"))
             if self._connection.poll(POLL_SECONDS):
                 break
         try:
@@ -108,21 +147,13 @@ class Process:
         return answer
 
     def close(self) -> None:
-        """End the process and remove its files."""
-        self._process.kill()
-        self._process.wait()
+        """End the process, and remove its files."""
         self._connection.close()
-        self._folder.cleanup()
-        if self in _at_work:
-            _at_work.remove(self)
+        super().close()
 
     def _end(self) -> tuple[BenchStatus, str]:
-        code = self._process.wait()
-        with self._words.open("rb") as file:
-            file.seek(max(0, self._words.stat().st_size - (1 << 20)))
-            text = file.read().decode(errors="replace")
-        words = last_words(text)
-        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        code, text = self.process.wait(), self.tail(1 << 20)
+        words, name = last_words(text), signal.Signals(-code).name if code < 0 else f"exit code {code}"
         reason = f"ended by {name}" + (f": {words}" if words else "")
         close = self.limit is not None and self.peak_bytes >= CLOSE_TO_LIMIT * self.limit
         if close:
@@ -132,7 +163,7 @@ class Process:
 
 
 #: Processes that are not closed.
-_at_work: list[Process] = []
+_at_work: list[Child] = []
 
 #: Held while a process is created, and after `abandon_all`.
 _making = threading.Lock()
@@ -144,19 +175,11 @@ def abandon_all() -> None:
     No process can be started afterwards.
     """
     _making.acquire(timeout=ABANDON_SECONDS)
-    for process in list(_at_work):
+    for child in list(_at_work):
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process._process.kill()
-            process._process.wait(timeout=ABANDON_SECONDS)
-        shutil.rmtree(process._folder.name, ignore_errors=True)
-
-
-def memory_of(process: int, kind: str) -> int:
-    """Return the memory of a process in bytes, or 0 if it is unknown. `kind` is as in /proc: `VmRSS` is the memory now,
-    `VmHWM` the largest so far, and `VmPeak` the largest address space.
-    """
-    found = of_system(f"/proc/{process}/status", kind)
-    return int(found.removesuffix(" kB")) * 1024 if found else 0
+            child.process.kill()
+            child.process.wait(timeout=ABANDON_SECONDS)
+        shutil.rmtree(child._folder.name, ignore_errors=True)
 
 
 def last_words(text: str) -> str:
@@ -173,13 +196,7 @@ Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 
 
 def _serve(first: dict[str, Any], does: str, connection: Connection) -> None:
-    os.environ |= {
-        # Dr.Jit's folders for compiled kernels: a cold step must find none.
-        "HOME": first["cache"],
-        "DRJIT_CACHE_DIR": first["cache"],
-        "OPTIX_CACHE_PATH": first["cache"],
-        "CUDA_CACHE_DISABLE": "1",
-    }
+    os.environ["HOME"] = os.environ["DRJIT_CACHE_DIR"]  # a cold step must find no compiled kernels
     from reslrb_cli.backend.variant import set_variant
 
     set_variant(first["variant"])

@@ -66,7 +66,11 @@ class Sampler:
         self.inside, self.mask = inside != 0, None if inside.all() else to_tensor(inside)
         self.adjoints = [to_tensor(array) for array in arrays.get("adjoints", ())]
         if quantity == "step":
-            self.adjoints = [_noise(width, height, int(film.base_channels_count()))]
+            noise = np.random.default_rng(1).uniform(0.5, 1.5, (height, width, int(film.base_channels_count())))
+            if noise.shape[2] in (2, 4):
+                noise[:, :, -1] = 0  # of alpha
+            self.adjoints = [mi.TensorXf(noise.astype(np.float32))]
+            dr.make_opaque(self.adjoints)
 
     def step(self, seed: int, spp: int, image: int = 0) -> tuple[np.ndarray, StepTimes]:
         """Return one sample as a flat float32 array of all parameters (or pixels), and the times of the step alone.
@@ -128,16 +132,6 @@ def begin(first: dict[str, Any]) -> Begun:
     """
     sampler = Sampler(told(first), first["quantity"], first["arrays"])
     return sampler.size, lambda question: sampler.answer(question, first["purpose"])
-
-
-def _noise(width: int, height: int, channels: int) -> Any:
-    """Return an image (H, W, C) of positive noise, with zeros in the alpha channel."""
-    values = np.random.default_rng(1).uniform(0.5, 1.5, (height, width, channels)).astype(np.float32)
-    if channels in (2, 4):
-        values[:, :, -1] = 0
-    image = mi.TensorXf(values)
-    dr.make_opaque(image)
-    return image
 
 
 _BITS = {"i1": 8, "half": 16, "float": 32, "double": 64, "ptr": 64}

@@ -352,7 +352,7 @@ def test_a_fresh_run_has_no_caches(monkeypatch):
     code, line = jobs.call([], sweep.Interrupts(), jobs.RunSlot(), fresh=True)
     *folders, disabled = ast.literal_eval(line)
     assert (code, disabled, len(set(folders))) == (0, "1", 1)
-    assert Path(folders[0]).name.startswith("reslrb-sweep-")
+    assert Path(folders[0]).name.startswith("reslrb-")
     assert not Path(folders[0]).exists()
     assert jobs.call([], sweep.Interrupts(), jobs.RunSlot()) == (0, str(["the user's"] * 4))
 

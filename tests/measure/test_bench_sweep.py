@@ -163,10 +163,9 @@ def test_a_warning_of_every_process_is_shown_once() -> None:
     assert said == ["scene.xml:3: old"]
 
 
-def test_depths() -> None:
-    assert depths(2) == [2]
-    assert depths(16) == [2, 4, 8, 16]
-    assert depths(20) == [2, 4, 8, 16, 20]
+def test_values_of_sweeps() -> None:
+    assert [depths(deepest) for deepest in (2, 16, 20)] == [[2], [2, 4, 8, 16], [2, 4, 8, 16, 20]]
+    assert [sample_counts(spp) for spp in (4, 2)] == [[1, 2, 4, 8, 16], [1, 2, 4, 8]]
 
 
 def test_options_of_cases() -> None:
@@ -208,6 +207,8 @@ def test_wrong_lists_are_located(text: str, line: str) -> None:
         bench_plan(loads(CONFIG, "x.yaml"), "depth", [2], text, 2, budget_s=1.0)
     assert str(caught.value).startswith("--integrators")
     assert line in str(caught.value)
+    with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
+        bench_plan(loads(CONFIG, "x.yaml"), "spp", [4, 3], LIST, 2, budget_s=1.0)
 
 
 def test_unnamed_cases_that_refuse_are_left_out():
@@ -244,16 +245,6 @@ def test_unmeasured_rows_are_named_by_the_varied_quantity() -> None:
     assert run_swept([8, 64], rounds=None)[1] == [
         "not measured: spp 8, 64: the budget was spent; allow more with --budget"
     ]
-
-
-def test_impossible_sample_counts_are_located() -> None:
-    with pytest.raises(ConfigError, match=r"--integrators ptracer: integrator.samples_per_pass: 2 does not divide"):
-        bench_plan(loads(CONFIG, "x.yaml"), "spp", [4, 3], LIST, 2, budget_s=1.0)
-
-
-def test_default_values() -> None:
-    assert sample_counts(4) == [1, 2, 4, 8, 16]
-    assert sample_counts(2) == [1, 2, 4, 8]
 
 
 def test_results_grow_with_each_round() -> None:

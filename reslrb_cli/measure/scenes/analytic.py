@@ -103,7 +103,14 @@ def refraction_scene(ior: float = 1.5) -> KnownScene:
 
     points, weights = plane_points(camera_height, 60, SIZE)
     height = light[1] - depth
-    theta = _refracted_angle(np.hypot(points[..., 0] - light[0], points[..., 2] - light[2]), height, depth, ior)
+    offset = np.hypot(points[..., 0] - light[0], points[..., 2] - light[2])
+    low, high = np.zeros_like(offset), np.full_like(offset, np.pi / 2 - 1e-9)
+    for _ in range(60):  # theta_1 of the light that arrives there, by bisection to double precision
+        theta = (low + high) / 2
+        sin_2 = np.sin(theta) / ior
+        beyond = height * np.tan(theta) + depth * sin_2 / np.sqrt(1 - sin_2**2) > offset
+        low, high = np.where(beyond, low, theta), np.where(beyond, theta, high)
+    theta = (low + high) / 2
     sin_2 = np.sin(theta) / ior
     cos_1, cos_2 = np.cos(theta), np.sqrt(1 - sin_2**2)
     slope = height / cos_1**2 + depth * cos_1 / (ior * cos_2**3)  # dx/dtheta_1
@@ -291,14 +298,3 @@ def plane_points(height: float, fov: float, size: int, order: int = 8) -> tuple[
     x, z = np.broadcast_arrays(at[None, :, None, :], at[:, None, :, None])
     points = np.stack([x, np.zeros_like(x), z], -1).reshape(size, size, order * order, 3)
     return points, np.outer(weights, weights).ravel() / 4
-
-
-def _refracted_angle(offset: Array, height: float, depth: float, ior: float) -> Array:
-    """Return theta_1 of the light that reaches the bottom at `offset`, by bisection to double precision."""
-    low, high = np.zeros_like(offset), np.full_like(offset, np.pi / 2 - 1e-9)
-    for _ in range(60):
-        middle = (low + high) / 2
-        sin_2 = np.sin(middle) / ior
-        beyond = height * np.tan(middle) + depth * sin_2 / np.sqrt(1 - sin_2**2) > offset
-        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-    return (low + high) / 2

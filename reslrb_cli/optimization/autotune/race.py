@@ -413,7 +413,9 @@ class StepTrial:
             apart = timed(times)
             taken.image_ms = apart.kernel_ms
             taken.wall_ms, taken.compile_ms = taken.wall_ms + apart.wall_ms, taken.compile_ms + apart.compile_ms
-        taken.images = {name: _few(image) for name, image in images.items()}
+        for key, image in images.items():  # some values, distributed over the image
+            values = np.array(image, dtype=np.float32).ravel()
+            taken.images[key] = finite(values[:: -(-values.size // MOST_VALUES)])
         return taken
 
     def _differentiate(self, tracer: Tracer, view: View, job: Job, gradient: mi.TensorXf) -> mi.TensorXf | None:
@@ -437,9 +439,3 @@ class StepTrial:
 
     def _seed(self, round: int, view: View, what: str) -> int:
         return seed(self._problem.config.run.seed, round, view.sensor, f"{self._what}, {what}")
-
-
-def _few(image: mi.TensorXf) -> Array:
-    """Return some values, distributed over an image. Non-finite values become 0."""
-    values = np.array(image, dtype=np.float32).ravel()
-    return finite(values[:: -(-values.size // MOST_VALUES)])
