@@ -12,9 +12,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from compilation import allocate_registers, combine, compute_alone, leave_out_optimisations, show_fatal_errors
+from golden import said
 from kit import with_wavelengths, work_in
 from report.chromium import Chromium, find_chromium
 from turns import in_part, read_part
@@ -138,6 +141,38 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Folder of the test as the working directory, with a cache of its own."""
     work_in(tmp_path, monkeypatch)
     return tmp_path
+
+
+@pytest.fixture
+def compared(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Compare the outputs of all commands that a test calls, and the configurations and scenes that they write, with
+    the stored ones. Long tests compute with other samples, so they are left out.
+    """
+    if not is_quick(request.config):
+        yield
+        return
+    from reslrb_cli.scene.load import warn_once
+
+    calls: list[Any] = []
+    invoke = CliRunner.invoke
+    warn_once.cache_clear()  # the output must not depend on earlier tests
+    monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
+
+    def remember(*given: Any, **options: Any) -> Any:
+        result = invoke(*given, **options)
+        lines = [line for line in result.output.splitlines() if not line.startswith("variant ")]
+        calls.append(said.masked([*map(str, given[2]), result.exit_code, *lines], tmp_path))
+        return result
+
+    monkeypatch.setattr(CliRunner, "invoke", remember)
+    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*") if file.is_file()}
+    yield
+    written = [
+        file for file in sorted(tmp_path.rglob("*")) if file.suffix in (".yaml", ".xml") and "runs" not in file.parts
+    ]
+    texts = {str(file.relative_to(tmp_path)): said.content(file, tmp_path) for file in written
+             if file.is_file() and not file.is_symlink() and before.get(file) != file.stat().st_mtime_ns}  # fmt: skip
+    said.check(f"{request.node.nodeid.removeprefix('tests/')}", {"calls": calls, **texts})
 
 
 def switched_on(switch: Callable[[bool], None], config: pytest.Config) -> Iterator[None]:

@@ -53,7 +53,7 @@ def commit_of(folder: Path) -> str | None:
     try:
         done = subprocess.run(
             ["git", "-C", str(folder), "rev-parse", "--verify", "HEAD"],
-            capture_output=True, text=True, timeout=10, check=False, stdin=subprocess.DEVNULL,
+            capture_output=True, text=True, timeout=10, check=False,
         )  # fmt: skip
     except (OSError, ValueError, subprocess.SubprocessError):
         return None

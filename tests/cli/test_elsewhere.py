@@ -17,6 +17,8 @@ from kit import area, diffuse, scene, sensor, shape
 
 from reslrb_cli.records.manifest import read_manifest
 
+pytestmark = pytest.mark.usefixtures("compared")
+
 # A scene whose objects have no ids, from `inspect` to the report page. The keys are the same everywhere.
 
 #: A corner scene as Mitsuba 0.6 wrote it. Its light comes from a separate file.

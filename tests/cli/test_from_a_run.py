@@ -31,7 +31,7 @@ from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.values import resample
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("llvm", "compared")
 
 
 LAMP = "lamp.emitter.radiance.value"

@@ -28,7 +28,7 @@ from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.proposal import TEXELS, _resolution, find_movable_in_view, propose, usual_bounds
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("llvm", "compared")
 
 
 # `init` writes a configuration that `optimize` accepts, from a scene alone and from a scene with a photograph.

@@ -14,7 +14,7 @@ from cli.tiny import done, outcome
 from reslrb_cli.cli.inspect import _counted, _reasons, _sized, _value, next_step, run_words
 from reslrb_cli.scene.catalog import ParameterInfo, SensorSummary, Value
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("llvm", "compared")
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "cornell_floor.yaml"
 TINY = ["--set", "scene.options={resx: 16, resy: 16}", "--set", "integrator.max_depth=4"]
 

@@ -1,4 +1,4 @@
-"""Everything that commands print and write (`golden.check`): refused calls, and measurements by pretended processes."""
+"""Everything that commands print and write (`said.check`): refused calls, and measurements by pretended processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli.tiny import files, outcome, reslrb, write_experiment, write_photo
-from golden import golden
+from golden import said
 from kit import work_in
 from measure.pretended_steps import CONFIG, Pretence, Pretended, Stage
 from report.measured import make_run
@@ -229,7 +229,7 @@ def test_refused_calls(folder: Path, call: str, monkeypatch: pytest.MonkeyPatch)
     code, out, err = outcome(*words)
     *before_it, line = err.splitlines()
     assert (code, out, [each for each in before_it if not each.startswith("variant ")]) == (2, "", [])
-    golden.check(f"call {call}", line.replace(f"{folder}/", ""))
+    said.check(f"call {call}", line.replace(f"{folder}/", ""))
     assert files(folder) == before
 
 
@@ -256,7 +256,7 @@ def check(*words: str) -> None:
         for line in lines
     ]
     written = [json.dumps(short(each)) for each in records]
-    golden.check(" ".join(words), [result.exit_code, *result.stdout.splitlines()[1:], *warned, *written])
+    said.check(" ".join(words), [result.exit_code, *result.stdout.splitlines()[1:], *warned, *written])
 
 
 def short(value: Any) -> Any:
@@ -365,7 +365,7 @@ def test_gradcheck(words: str, records: list[GradcheckRecord], monkeypatch: pyte
         extreme, "CASES", {name: SimpleNamespace(not_spectral=reason) for name, reason in reasons.items()}
     )
     check("gradcheck", *([] if "--suite" in words else ["x.yaml"]), *words.split())
-    golden.check(f"settings of gradcheck {words}", told)
+    said.check(f"settings of gradcheck {words}", told)
 
 
 @pytest.mark.usefixtures("_work")
@@ -396,4 +396,4 @@ def test_gradcheck_missing(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(missing, "MissingCheck", Missing)
     monkeypatch.setattr(gradcheck, "time", SimpleNamespace(monotonic=lambda: clock.now))
     check("gradcheck", "x.yaml", "--missing", *words.split())
-    golden.check(f"times of gradcheck --missing {words}", asked)
+    said.check(f"times of gradcheck --missing {words}", asked)

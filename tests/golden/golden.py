@@ -1,4 +1,4 @@
-"""Golden values: the exact bits of three iterations of each run in `RUNS`, and the output of commands and functions.
+"""Golden values: the exact bits of three iterations of each run in `RUNS`, and the output of commands.
 
 The golden values protect changes that must not change any result, for example merged, moved or renamed files. Run as a
 program, this file rewrites `values.json` in the same folder for this processor and libLLVM. On another machine, run it
@@ -8,18 +8,14 @@ sums over several threads are not reproducible.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
-import math
 import os
 import re
 import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +23,6 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
 VALUES = Path(__file__).with_name("values.json")
-#: Values of `check`, and the environment variable that makes `check` store them, if its value is `write`.
-SAID, WRITE = Path(__file__).with_name("said.json"), "RESLRB_GOLDEN"
-#: A number with decimals or an exponent. Such numbers may differ by a hundredth, which covers rounding in print.
-isclose = partial(math.isclose, rel_tol=0.01, abs_tol=1e-6)
-_DECIMAL = re.compile(r"(-?\d+\.\d+(?:e[-+]\d+)?|-?\d+e[-+]\d+)")
 SCHEMA = ROOT / "docs" / "config.schema.json"
 #: The smallest settings that still exercise every part of a run. Plain gradient descent hides no bit of the gradients.
 SMALL = (
@@ -207,63 +198,6 @@ def form_of(name: str) -> list[str]:
             [json.loads(text)] if whole else [json.loads(line) for line in text.splitlines() if line.startswith("{")]
         )
     return sorted({json.dumps(form(line), sort_keys=True) for line in lines})
-
-
-def check(name: str, found: Any) -> None:
-    """Compare a text, or a value for JSON, with the stored one of this `name`. Decimals may differ by a hundredth."""
-    found = json.loads(json.dumps(found.splitlines() if isinstance(found, str) else found, default=str))
-    content = json.loads(SAID.read_text())
-    if os.environ.get(WRITE) == "write":
-        content[name] = found
-        SAID.write_text(_written(content))
-    changed = _differences(found, content.get(name))
-    assert not changed, f"{name} has changed; if intended, run the test with {WRITE}=write\n" + "\n".join(changed[:9])
-
-
-def _differences(found: Any, known: Any, place: str = "") -> list[str]:
-    """Return a line for each difference. Decimals may differ by a hundredth, also within texts."""
-    if isinstance(found, dict) and isinstance(known, dict):
-        pairs = ((found.get(key), known.get(key), f"{place} {key}") for key in dict.fromkeys([*known, *found]))
-        return [line for pair in pairs for line in _differences(*pair)]
-    if isinstance(found, list) and isinstance(known, list):
-        pairs = ((*pair, f"{place} {number}") for number, pair in enumerate(zip_longest(found, known)))
-        return [line for pair in pairs for line in _differences(*pair)]
-    parts, others = (_DECIMAL.split(str(each)) for each in (found, known))
-    is_alike = type(found) is type(known) and parts[::2] == others[::2]
-    if is_alike and all(isclose(float(a), float(b)) for a, b in zip(parts[1::2], others[1::2], strict=True)):
-        return []
-    return [f"{place}: {found!r} was {known!r}"]
-
-
-def _written(content: dict[str, Any]) -> str:
-    """Return JSON with one line for each entry of each value."""
-    parts = []
-    for name, value in sorted(content.items()):
-        text = json.dumps(value, sort_keys=True)
-        if isinstance(value, dict):
-            inner = ",\n".join(
-                f"  {json.dumps(key)}: {json.dumps(value[key], sort_keys=True)}" for key in sorted(value)
-            )
-            text = f"{{\n{inner}\n }}"
-        elif isinstance(value, list):
-            text = "[\n" + ",\n".join(f"  {json.dumps(each, sort_keys=True)}" for each in value) + "\n ]"
-        parts.append(f" {json.dumps(name)}: {text}")
-    return "{\n" + ",\n".join(parts) + "\n}\n"
-
-
-def plain(value: Any) -> Any:
-    """Return a value for JSON: records as mappings without None and False, arrays as shape, type, sum and
-    norm, and objects of scenes as ids.
-    """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        entries = ((each.name, plain(getattr(value, each.name))) for each in dataclasses.fields(value))
-        return {name: entry for name, entry in entries if entry is not None and entry is not False}
-    if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
-    if isinstance(value, np.ndarray):
-        wide = value.astype(np.float64)
-        return [str(value.shape), str(value.dtype), float(wide.sum()), float(np.linalg.norm(wide))]
-    return value.id() if hasattr(value, "class_name") else value
 
 
 def texts() -> dict[str, str]:

@@ -26,6 +26,8 @@ from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.records.images import write_file
 from reslrb_cli.scene.images import read_image
 
+pytestmark = pytest.mark.usefixtures("compared")
+
 OPTIONS = {
     "lens": [],
     "mirror": ["--mirror", "30"],

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from cli.tiny import done, reslrb, settings
+from golden import said
 from lens.test_experiment import picture
 from skimage.metrics import structural_similarity
 
@@ -289,3 +290,13 @@ def test_the_page_of_a_run_has_the_figures_for_the_maker(
     text = (tmp_path / "made/sheet.html").read_text()
     assert "distance +2 %: SSIM" in text
     assert f"±{number(allowed['distance']['value'], 2)} mm" in text
+
+
+def test_everything_that_a_lens_writes(lens: Path) -> None:
+    """The experiment, the solid in the run folder, and the export with tolerances."""
+    for part in ("lens", "runs/lens/fabrication.json", "runs/lens/images", "out"):
+        place = lens / part
+        files = sorted(place.rglob("*")) if place.is_dir() else [place]
+        found = {str(file.relative_to(lens)): said.content(file, lens) for file in files if file.is_file()}
+        said.check(f"lens: {part}", found)
+    said.check("lens: output", said.masked((lens / "said.txt").read_text().splitlines(), lens))

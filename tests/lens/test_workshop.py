@@ -20,6 +20,8 @@ from reslrb_cli.report.page.workshop import material, setup_facts
 from reslrb_cli.runs.export import read_solid
 from reslrb_cli.runs.workshop import allowed_errors, setup_of
 
+pytestmark = pytest.mark.usefixtures("compared")
+
 
 def test_the_step_of_a_ball_leaves_scallops_of_the_given_height() -> None:
     step = stepover(3.0)

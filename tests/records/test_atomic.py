@@ -228,6 +228,13 @@ def test_a_damaged_archive_has_a_reason(tmp_path: Path, error: Exception, reason
         raise error
 
 
+@pytest.mark.parametrize("error", [MemoryError(), OSError(errno.ENOSPC, "full"), RuntimeError("out of memory")])
+def test_a_fault_of_the_machine_is_not_blamed_on_an_archive(tmp_path: Path, error: Exception) -> None:
+    np.savez(tmp_path / "state.npz", a=np.ones(3))
+    with pytest.raises(type(error)), open_archive(tmp_path / "state.npz"):
+        raise error
+
+
 def test_unopenable_files_are_located(tmp_path: Path) -> None:
     np.savez(tmp_path / "state.npz", a=np.ones(3))
     with pytest.raises(ConfigError, match="holds values alone, not the state of a run"):

@@ -17,6 +17,8 @@ from reslrb_cli.records.images import (
     load_image,
     luminance,
     read_layers,
+    read_mask,
+    read_parameters,
     write_file,
     write_image,
     write_layers,
@@ -89,6 +91,12 @@ def test_small_values_are_listed_and_large_ones_are_only_in_the_archive(tmp_path
 def test_missing_and_damaged_images_are_none(tmp_path):
     (tmp_path / "damaged.exr").write_bytes(b"\x76\x2f\x31\x01 and no more")
     assert load_image(tmp_path / "damaged.exr") is load_image(tmp_path / "missing.exr") is None
+    for content in (b"", b"\x93NUMPY and no more", b"no array"):
+        (tmp_path / "key.mask.npy").write_bytes(content)
+        (tmp_path / "parameters.npz").write_bytes(content)
+        assert (read_mask(tmp_path, "key"), read_parameters(tmp_path)) == (None, {})
+    np.save(tmp_path / "key.mask.npy", np.ones(3))  # no mask
+    assert read_mask(tmp_path, "key") is None
 
 
 def test_ranges_and_luminances_of_images():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
 import subprocess
@@ -37,6 +39,16 @@ def test_one_at_a_time(tmp_path: Path) -> None:
         with pytest.raises(InUse):
             FolderLock(tmp_path, wait_s=0, shared=True)
     FolderLock(tmp_path, wait_s=0).release()
+
+
+@pytest.mark.parametrize("number", [errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES])
+def test_every_error_of_a_held_lock_counts(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", fail)
+    with pytest.raises(InUse):
+        FolderLock(tmp_path, wait_s=0)
 
 
 def test_readers_do_not_disturb_each_other_and_nobody_gives_up(tmp_path: Path) -> None:

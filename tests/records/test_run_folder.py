@@ -258,6 +258,14 @@ def test_a_killed_run_is_interrupted(tmp_path):
     assert sorted(os.listdir(tmp_path)) == [MANIFEST_FILE, "metrics.jsonl"]
 
 
+@pytest.mark.parametrize("name", [MANIFEST_FILE, "metrics.jsonl", "checkpoint", "images", "parameters"])
+def test_the_last_file_of_a_killed_run_tells_its_end(tmp_path, name):
+    abandoned(tmp_path)
+    (tmp_path / name).touch()
+    os.utime(tmp_path / name, (2e9, 2e9))
+    assert read_manifest(tmp_path, mend=False)["ended"] == "2033-05-18T03:33:20+00:00"
+
+
 def test_a_continued_run_is_running(tmp_path):
     abandoned(tmp_path)
     with FolderLock(tmp_path):
@@ -316,7 +324,7 @@ def test_the_last_status_of_an_exiting_process_stays(tmp_path, monkeypatch):
         thread.start()
         thread.join(timeout=0.5)
     assert thread.is_alive()
-    assert stored(tmp_path)["status"] == "interrupted"
+    assert (stored(tmp_path)["status"], stored(tmp_path)["ended"] is None) == ("interrupted", False)
 
 
 # The cache of decisions.
@@ -358,6 +366,7 @@ def test_the_oldest_entries_are_dropped(tmp_path: Path) -> None:
     cache.put("new", made("new"))
     assert [cache.get(key) for key in ("0", "1", "new")] == [None, made(1), made("new")]
     cache.put("1", made("again"))  # becomes the newest
+    assert list(json.loads((tmp_path / CACHE_FILE).read_text()))[-2:] == ["new", "1"]
     cache.put("newer", made("newer"))
     assert [cache.get(key) for key in ("1", "2", "3")] == [made("again"), None, made(3)]
 

@@ -1,4 +1,4 @@
-"""Everything that runs, sweeps, searches and loggers write (`golden.check`), but for times."""
+"""Everything that runs, sweeps, searches and loggers write (`said.check`), but for times."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
-import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
 from cli.tiny import reslrb, settings
-from golden import golden
+from golden import said
 from kit import work_in
 from records.test_metrics import make_record
 
@@ -26,42 +25,6 @@ from reslrb_cli.runs.callbacks import RunInfo
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
-#: Entries that differ between machines or runs, and times in text.
-OTHERS = {
-    *("step_ms", "codegen_ms", "elapsed_s", "first_s", "peak_mib", "curvature_s", "at", "started", "ended", "process"),
-    *("device", "platform", "versions", "commit", "written", "seconds", "program", "files", "codes"),
-    *("command_line", "command"),
-}
-_TIME = re.compile(r"\d{4}-\d\d-\d\dT[\d:+]+|\b\d+\.\d+ s\b|\b\d+ MiB\b")
-
-
-def masked(value: Any, folder: Path) -> Any:
-    """Return a value of JSON without what differs between machines or runs."""
-    if isinstance(value, dict):
-        return {key: "..." if key in OTHERS else masked(each, folder) for key, each in value.items()}
-    if isinstance(value, list):
-        return [masked(each, folder) for each in value]
-    return _TIME.sub("...", value.replace(str(folder), "HERE")) if isinstance(value, str) else value
-
-
-def content(file: Path, folder: Path) -> Any:
-    """Return the content of a file for comparison."""
-    if file.suffix == ".npz":
-        with np.load(file) as arrays:
-            found = {name: golden.plain(arrays[name]) for name in arrays.files if name != "state"}
-            state = json.loads(arrays["state"].tobytes()) if "state" in arrays else None
-        return masked(found | ({} if state is None else {"state": state}), folder)
-    if file.suffix in (".exr", ".png"):
-        return golden.plain(np.array(mi.Bitmap(str(file))))
-    if file.suffix == ".npy":
-        return golden.plain(np.load(file))
-    text = file.read_text()
-    if file.suffix == ".json":
-        return masked(json.loads(text), folder)
-    if file.suffix == ".jsonl":
-        return [json.dumps(masked(json.loads(line), folder)) for line in text.splitlines()]
-    return masked(text.splitlines(), folder) if file.suffix in (".yaml", ".log", ".xml") else "text"
-
 
 def check(name: str, folder: Path, *words: str, root: str = "runs") -> None:
     """Run a command, and check its exit code, its output and all files below `root` that changed."""
@@ -69,13 +32,17 @@ def check(name: str, folder: Path, *words: str, root: str = "runs") -> None:
     result = reslrb(*words)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     lines = [line for line in result.stderr.splitlines() if not line.startswith("variant ")]
-    found = {"code": result.exit_code, "out": masked(result.stdout.splitlines(), folder), "err": masked(lines, folder)}
+    found = {
+        "code": result.exit_code,
+        "out": said.masked(result.stdout.splitlines(), folder),
+        "err": said.masked(lines, folder),
+    }
     for file in sorted(Path(root).rglob("*")):
         if file.is_symlink():
             found[str(file)] = f"link to {file.readlink()}"
         elif file.is_file() and before.get(file) != file.stat().st_mtime_ns:
-            found[str(file)] = content(file, folder) if file.suffix != ".yaml" or "search" not in name else "text"
-    golden.check(name, found)
+            found[str(file)] = said.content(file, folder) if file.suffix != ".yaml" or "search" not in name else "text"
+    said.check(name, found)
 
 
 @pytest.fixture
@@ -162,7 +129,7 @@ def test_sweeps(
     check(name, folder, "sweep", "tiny.yaml", *words, "-o", "s", root="s")
     monkeypatch.setattr(sweep, "call", pretend({}, told))
     check(f"{name}, again", folder, "sweep", "--resume", "s", *again, root="s")
-    golden.check(f"{name}, calls", masked(told, folder))
+    said.check(f"{name}, calls", said.masked(told, folder))
 
 
 # Loggers, with packages that only remember their calls.
@@ -174,7 +141,7 @@ def remembered(value: Any) -> Any:
         return {str(key): remembered(each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
         return [remembered(each) for each in value]
-    return golden.plain(value) if isinstance(value, (int, float, str, np.ndarray, type(None))) else "..."
+    return said.plain(value) if isinstance(value, (int, float, str, np.ndarray, type(None))) else "..."
 
 
 @pytest.mark.parametrize("status", ["finished", "interrupted", "failed"])
@@ -202,5 +169,5 @@ def test_loggers(name: str, active: bool, status: str, tmp_path: Path, monkeypat
         logger.image(run, "final", np.full((2, 3, 1), 0.1, np.float32), 1.0)
         logger.end(run, status)
     calls = [f"{call[0]} {json.dumps(remembered([call[1], call[2]]))}" for call in fake.mock_calls]
-    golden.check(f"{name}, {active}, {status}", masked([re.sub("x{20,}", lambda m: f"x * {len(m[0])}", each)
+    said.check(f"{name}, {active}, {status}", said.masked([re.sub("x{20,}", lambda m: f"x * {len(m[0])}", each)
                                                         for each in calls], tmp_path))  # fmt: skip

@@ -26,8 +26,9 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
-from reslrb_cli.records.run_folder import read_config, read_value
+from reslrb_cli.records.run_folder import RunFolder, read_config, read_value
 from reslrb_cli.runs import prepare, recorder, resume
+from reslrb_cli.runs.log import append_log
 from reslrb_cli.runs.prepare import moves
 
 STATE, PREVIOUS = "checkpoint/state.npz", "checkpoint/previous.npz"
@@ -69,7 +70,7 @@ def rewritten(run: Path, arrays: dict[str, Any] | None = None, values: dict[str,
 
 PARAMETER = f"parameter/{tiny.KEY}"
 WRONG: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
-    "a shape": ({PARAMETER: np.ones((4, 5, 3), np.float32)}, {}, f"{PARAMETER}: has shape (4, 5, 3), not (4, 4, 3)"),
+    "a shape": ({PARAMETER: np.ones((4, 3, 4), np.float32)}, {}, f"{PARAMETER}: has shape (4, 3, 4), not (4, 4, 3)"),
     "objects": ({"mask/x": np.array([{}], dtype=object)}, {}, "is damaged, cut off, or not written by reslrb ("),
     "no state": ({"state": None}, {}, ""),
     "more iterations than its history": ({}, {"iteration": 6}, "history/loss: has shape (4,), not (6,)"),
@@ -352,6 +353,50 @@ def test_only_the_place_of_a_file_may_change(interrupted: Path) -> None:
         assert moves(key, (before, now), config) == allowed, key
 
 
+def test_files_of_initial_values_may_change(tmp_path: Path) -> None:
+    tiny.write_experiment(tmp_path)
+    config = load(tmp_path / "tiny.yaml", ["parameters[0].initial={file: poster.exr}"])
+    assert {key.partition(" ")[0] for key in prepare.digests(config)} == {"scene.file"}
+
+
+def test_a_continued_run_keeps_its_past_and_tidies_up(run: Path) -> None:
+    """The record of the past has entries that only a measurement before the first iteration can make."""
+    manifest = json.loads((run / "manifest.json").read_text())
+    past = {"incomplete": [{"parameter": "a", "share": 0.5}], "started": "2026-01-01T00:00:00+00:00", "commit": "abc"}
+    past |= {"resumed": [{"iteration": 2}], "versions": manifest["versions"] | {"mitsuba": "0.1"}}
+    (run / "manifest.json").write_text(json.dumps(manifest | past))
+    (run / "images/.x.png.77.part").touch()
+    assert optimize("--resume", str(run), "--quiet") == 0
+    found = json.loads((run / "manifest.json").read_text())
+    assert {key: found[key] for key in ("incomplete", "started", "commit")} == {
+        key: past[key] for key in ("incomplete", "started", "commit")
+    }
+    first, second = found["resumed"]
+    assert (first, second["iteration"], second["changed"]) == ({"iteration": 2}, 4, {})
+    assert second["versions"] == {"mitsuba": ["0.1", manifest["versions"]["mitsuba"]]}
+    assert list(run.rglob(".*.part")) == []
+
+
+def test_unfinished_files_of_a_run_are_removed_at_its_end(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = recorder.write_parameters
+    monkeypatch.setattr(recorder, "write_parameters", lambda *given: ((run / ".y.1.part").touch(), write(*given)))
+    assert optimize("--resume", str(run), "--quiet") == 0
+    assert list(run.rglob(".*.part")) == []
+
+
+def test_any_text_can_be_logged(run: Path) -> None:
+    append_log(RunFolder(run), ["a\udcff"])
+    assert (run / "run.log").read_text().endswith("a\\udcff\n")
+
+
+def test_the_commit_is_that_of_the_configuration(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders: list[Path] = []
+    monkeypatch.setattr(prepare, "commit_of", folders.append)
+    monkeypatch.chdir("/")
+    assert optimize(str(run / "config.yaml"), "--quiet", "--set", "run.iterations=1", "--set", "run.name=x") == 0
+    assert folders == [run]
+
+
 def test_a_missing_file_is_named(run: Path, interrupted: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = interrupted.parents[1] / "scene.xml"
     line = told(capsys, run, "--set", f"scene.file={run}/other.xml")
@@ -369,6 +414,9 @@ def test_values_outlive_the_checkpoints(run: Path, tmp_path: Path, capsys: pytes
     assert not end.value.code, capsys.readouterr().err
     with pytest.raises(ConfigError, match=f"did not recover `other`; it has `{tiny.KEY}`$"):
         read_value(run, "other")
+    np.savez(run / "parameters/parameters.npz", **{f"key{number}": np.zeros(3) for number in range(4)})
+    with pytest.raises(ConfigError, match=r"did not recover `key9`; it has `key.` and `key.` and `key.` and 1 more$"):
+        read_value(run, "key9")
     (run / "parameters/parameters.npz").unlink()
     with pytest.raises(ConfigError, match=r"has no checkpoint/state\.npz"):
         read_value(run, tiny.KEY)

@@ -21,7 +21,7 @@ from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import Selection, select_parameters
 from reslrb_cli.scene.xml.read import Description
 
-pytestmark = pytest.mark.usefixtures("llvm")
+pytestmark = pytest.mark.usefixtures("llvm", "compared")
 BITMAP = '<string name="filename" value="{}"/><string name="format" value="variant"/>'
 EIGHT_BITS = '<string name="filename" value="{}"/>'
 #: A scene with every way to specify a recoverable parameter: by number, colour, image, index, mesh and place. Objects

@@ -1,4 +1,4 @@
-"""What the program finds in scenes with every plugin (`golden.check`): parameters, features, proposals and views."""
+"""What the program finds in scenes with every plugin (`said.check`): parameters, features, proposals and views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from cli.every_plugin import ROWS, Row, write_files
-from golden import golden
+from golden import said
 
 from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.graph import SceneGraph
@@ -40,20 +40,20 @@ def described(file: str) -> dict[str, Any]:
     gc.collect()  # Mitsuba asks emitters of former scenes, too
     scene = load_scene(Path(file))
     summary, sensors = summarise(scene), scene.sensors()
-    found: dict[str, Any] = {f"parameter {info.key}": golden.plain(info) for info in summary.parameters}
-    found |= {f"sensor {view.index}": golden.plain(view) for view in summary.sensors}
+    found: dict[str, Any] = {f"parameter {info.key}": said.plain(info) for info in summary.parameters}
+    found |= {f"sensor {view.index}": said.plain(view) for view in summary.sensors}
     found |= {name: getattr(summary, name) for name in ("emitters", "bsdfs", "shapes", "triangles", "movable")}
     if summary.sensors[0].view is None:
         return found
     needs = scene_needs(scene, sensors[0])
-    found |= {f"needs {name}": golden.plain(value) for name, value in vars(needs).items()}
+    found |= {f"needs {name}": said.plain(value) for name, value in vars(needs).items()}
     found["clip"] = stock_clip(needs)
     found["blends"] = blend_warning(SceneGraph.of(scene), needs.blends)
     found["paths"] = [usual_paths(scene, sensors, depth, hidden, moves)
                       for depth in (2, 4) for hidden in (False, True) for moves in (False, True)]  # fmt: skip
     found["camera finds all"] = [camera_finds_all(scene, depth, gloss) for depth in (2, 3) for gloss in (False, True)]
     for proposal in propose(scene, 0, lamps=True):
-        found[f"proposal {proposal.info.key}"] = golden.plain(proposal) | {"info": None}
+        found[f"proposal {proposal.info.key}"] = said.plain(proposal) | {"info": None}
     found["in view"] = find_movable_in_view(scene, 0)
     found["specular"] = [int(sees_specular(scene, sensors[0], partly).sum()) for partly in (False, True)]
     found["lamps"] = int(sees_lamps(scene, sensors[0]).sum())
@@ -69,11 +69,11 @@ def plain() -> dict[str, Any]:
 
 
 def test_the_plain_scene(plain: dict[str, Any]) -> None:
-    golden.check("scene", plain)
+    said.check("scene", plain)
 
 
 @pytest.mark.parametrize("row", LOADED, ids=[row.name for row in LOADED])
 def test_every_plugin(row: Row, plain: dict[str, Any]) -> None:
     Path("scene.xml").write_text(row.xml())
     found = described("scene.xml")
-    golden.check(f"scene with {row.name}", {key: value for key, value in found.items() if plain.get(key) != value})
+    said.check(f"scene with {row.name}", {key: value for key, value in found.items() if plain.get(key) != value})
