@@ -70,9 +70,18 @@ CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 SMALL_BOX = ["run.spp=4", "target={render: {spp: 4}}"]
 
 
+def box(*overrides: str) -> Config:
+    """Return the experiment of the small Cornell box."""
+    return loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides])
+
+
+def situation(made: Case, depth: int = 4, hidden: bool = False, *more: Any, **options: Any) -> Situation:
+    """Return the situation of a case with its first sensor."""
+    return Situation.of(made.scene, made.scene.sensors()[0], made.params, depth, hidden, *more, **options)
+
+
 def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[GradcheckRecord]:
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides])
-    made = Gradcheck(CheckSettings(config, estimators_of(estimators), 0, seeds))
+    made = Gradcheck(CheckSettings(box(*overrides), estimators_of(estimators), 0, seeds))
     return list(made.run(lambda: False, lambda line: None))
 
 
@@ -118,8 +127,7 @@ def test_differently_sampled_paths_agree_with_naive_ad_in_expectation(drawn: str
 def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch: pytest.MonkeyPatch):
     """Runs with guiding, or with `auto`, are compared with unguided steps, which lack a fault of the tables."""
     guided = (f"integrator.guiding={guiding}", *SMALLER)
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *guided])
-    made = Gradcheck(CheckSettings(config, estimators_of("stack"), 0, 8))
+    made = Gradcheck(CheckSettings(box(*guided), estimators_of("stack"), 0, 8))
     made.rows = [row for row in made.rows if row.reference is Reference.UNGUIDED]
     [record] = made.run(lambda: False, lambda line: None)
     assert (record.seeds, record.holds) == (8, True)
@@ -130,39 +138,40 @@ def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch:
     assert guiding == "on" or found == {("stack", "unguided")}
 
 
-def test_a_wrong_selection_weight(monkeypatch: pytest.MonkeyPatch):
-    """The reservoir is wrong by a fifth. All of its references fail."""
-    right = reservoir.slot_adjoint
-    monkeypatch.setattr(reservoir, "slot_adjoint", lambda p, W, *rest: right(p, W * 1.2, *rest))
-    found = failures(check(*SMALLER, estimators="reservoir", seeds=16))
-    assert found == {("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")}
-
-
-def test_a_slightly_wrong_derivative(monkeypatch: pytest.MonkeyPatch):
-    right = stack.pass_vertex
-    monkeypatch.setattr(stack, "pass_vertex", lambda *arguments: right(*arguments[:-1], arguments[-1] * 1.001))
-    found = failures(check(*SMALLER, estimators="stack,gather"))
-    assert found == {("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")}
-
-
-def test_forward_mode_without_the_weight_of_roulette(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(forward.TangentSplat, "survived", lambda self, state, weight: state)
-    assert failures(check("integrator.rr_depth=1", *SMALLER, estimators="stack")) == {("stack", "forward_mode")}
-
-
-def test_a_fault_of_the_walk_does_not_affect_its_references(monkeypatch: pytest.MonkeyPatch):
-    """Connections are too strong by 30 %. The image and the gradient differ from the stock reference, and agree with
-    naive AD and finite differences.
-    """
-    right = segment.connect
-
+def stronger(right: Any) -> Any:
     def connect(*arguments):
         connection = right(*arguments)
         connection.rest = connection.rest * 1.3
         return connection
 
-    monkeypatch.setattr(segment, "connect", connect)
-    assert failures(check(*SMALLER, estimators="stack")) == {(None, "ptracer"), ("stack", "ptracer")}
+    return connect
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "wrong", "estimators", "settings", "fails"),
+    [
+        # The reservoir is wrong by a fifth. All of its references fail.
+        (reservoir, "slot_adjoint", lambda right: lambda p, W, *rest: right(p, W * 1.2, *rest), "reservoir", (),
+         [("reservoir", name) for name in ("walk_ad", "ptracer", "finite_difference", "forward_mode")]),
+        # A slightly wrong derivative.
+        (stack, "pass_vertex", lambda right: lambda *given: right(*given[:-1], given[-1] * 1.001), "stack,gather", (),
+         [("stack", name) for name in ("walk_ad", "finite_difference", "forward_mode")]),
+        # Forward mode lacks the weight of roulette.
+        (forward.TangentSplat, "survived", lambda right: lambda self, state, weight: state, "stack",
+         ("integrator.rr_depth=1",), [("stack", "forward_mode")]),
+        # Connections are too strong by 30 %. The image and the gradient differ from the stock reference, and agree with
+        # naive AD and finite differences, which share the fault.
+        (segment, "connect", stronger, "stack", (), [(None, "ptracer"), ("stack", "ptracer")]),
+    ],
+    ids=["selection", "derivative", "roulette", "connection"],
+)  # fmt: skip
+def test_a_fault_fails_against_the_references_that_do_not_share_it(
+    module: Any, name: str, wrong: Any, estimators: str, settings: tuple[str, ...], fails: list[Any],
+    monkeypatch: pytest.MonkeyPatch,
+):  # fmt: skip
+    monkeypatch.setattr(module, name, wrong(getattr(module, name)))
+    seeds = 16 if estimators == "reservoir" else 8
+    assert failures(check(*settings, *SMALLER, estimators=estimators, seeds=seeds)) == set(fails)
 
 
 def pretended(settings: CheckSettings, monkeypatch: pytest.MonkeyPatch, load_s: float = 2.0) -> Gradcheck:
@@ -183,8 +192,7 @@ def pretended(settings: CheckSettings, monkeypatch: pytest.MonkeyPatch, load_s: 
 
 def test_all_quantities_take_turns(monkeypatch: pytest.MonkeyPatch):
     """The order does not depend on time. At the end, all quantities have as many seeds as were asked for."""
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    taken, made = [], pretended(CheckSettings(config, estimators_of("stack,event"), 0, 5), monkeypatch)
+    taken, made = [], pretended(CheckSettings(box(), estimators_of("stack,event"), 0, 5), monkeypatch)
     right = made.participants.sample
     made.participants.sample = lambda *name: taken.append(name) or right(*name)
     said: list[str] = []
@@ -203,8 +211,7 @@ def test_a_budget_ends_early(budget_s: float, seeds: int | None, counts: set[int
     """A sample that has started is finished. Comparisons with fewer than 8 seeds are unresolved and say how many they
     had, and comparisons without any are named. If no more seeds were asked for, the advice is to use more.
     """
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, SMALL)
-    made = pretended(CheckSettings(config, estimators_of("stack,event"), budget_s, seeds), monkeypatch)
+    made = pretended(CheckSettings(box(), estimators_of("stack,event"), budget_s, seeds), monkeypatch)
     monkeypatch.setattr("reslrb_cli.measure.gradcheck.value_shape", lambda value: (4,))
     monkeypatch.setattr(made.participants.case, "weights", np.zeros(4))
     made.participants.case.places = dict.fromkeys(made.participants.case.places, slice(0, 4))
@@ -233,7 +240,7 @@ def test_a_budget_ends_early(budget_s: float, seeds: int | None, counts: set[int
 
 
 def test_an_interrupt_compares_the_finished_samples():
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *SMALLER])
+    config = box(*SMALLER)
     asked = iter(range(10_000))
     made = Gradcheck(CheckSettings(config, estimators_of("stack"), 0, 8))
     records = list(made.run(lambda: next(asked) > 10, lambda line: None))
@@ -254,8 +261,7 @@ def test_samples_on_file_are_not_drawn_again(variant: str, tmp_path: Path):
     file = tmp_path / "draws.npz"
 
     def records(seeds: int, estimators: str = "stack", *overrides: str) -> tuple[list[GradcheckRecord], int]:
-        small_box = [*SMALL, "scene.options.size=8", f"variant={variant}", *overrides]
-        config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, small_box)
+        config = box("scene.options.size=8", f"variant={variant}", *overrides)
         made = Gradcheck(CheckSettings(config, estimators_of(estimators), 0, seeds), file=DrawsFile(file))
         taken, right = [], made.participants.sample
         made.participants.sample = lambda *name: taken.append(name) or right(*name)  # type: ignore[method-assign]
@@ -273,12 +279,11 @@ def test_samples_on_file_are_not_drawn_again(variant: str, tmp_path: Path):
 
 
 def test_estimators_have_the_options_of_the_configuration():
-    config = loads(
-        small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, ["integrator.estimator=reservoir", "integrator.capacity=4"]
-    )
+    config = box("integrator.estimator=reservoir", "integrator.capacity=4")
     assert [case.label for case in all_estimators(config)] == [
         "reslrb:reservoir(capacity=4)", "reslrb:gather", "reslrb:event", "reslrb:stack"
     ]  # fmt: skip
+    assert [case.label for case in all_estimators(box("integrator.paths=camera"))] == ["reslrb:stack"]
     assert [case.options for case in estimators_of("event(capacity=2)")] == [{"estimator": "event", "capacity": 2}]
     for text, message in (
         ("stack,stack", "given twice"), ("stack(max_depth=3)", "--set integrator.max_depth=3"),
@@ -294,7 +299,7 @@ def test_references_match_the_conformance_tests(case):
     also `prb` except for keys of `floor.brdf`.
     """
     scene = Case(case.scene(), case.keys)
-    at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, case.options["max_depth"], False)
+    at = situation(scene, case.options["max_depth"])
     reasons = {"ptracer": ptracer_gradient, "prb": prb_gradient}
     for key in case.keys:
         if isinstance(case.source, Differences):
@@ -306,28 +311,21 @@ def test_references_match_the_conformance_tests(case):
 
 def test_references_refuse_unsupported_parameters():
     scene = Case(room(floor={"type": "twosided", "bsdf": diffuse(0, 0, 0)}), ["floor.brdf_0.reflectance.value"])
-    [key], sensor = scene.keys, scene.scene.sensors()[0]
-
-    def at(depth: int = 4, hidden: bool = False) -> Situation:
-        return Situation.of(scene.scene, sensor, scene.params, depth, hidden)
-
-    assert "throughput 0" in ptracer_gradient(at(), key)
-    assert "exactly 0" in prb_gradient(at(), key)
-    assert ptracer_image(at()) is path_image(at()) is None
-    assert "without roulette" in ptracer_image(at(-1))
+    [key], at = scene.keys, situation(scene)
+    assert "throughput 0" in ptracer_gradient(at, key)
+    assert "exactly 0" in prb_gradient(at, key)
+    assert ptracer_image(at) is path_image(at) is None
+    assert "without roulette" in ptracer_image(situation(scene, -1))
     lit = Case(room(lamp=None, light={"type": "point", "position": [0.5, 0.9, 0.8], "intensity": rgb(1, 2, 3)},
                     ball={"type": "sphere", "radius": 0.2, "bsdf": {"type": "dielectric"}}), [])  # fmt: skip
-    assert "point or parallel lights" in path_image(
-        Situation.of(lit.scene, lit.scene.sensors()[0], lit.params, 4, False)
-    )
+    assert "point or parallel lights" in path_image(situation(lit))
 
 
 def test_ptracer_is_no_reference_with_cutting_clip_planes():
     lens = {"type": "thinlens", "aperture_radius": 0.05, "focus_distance": 4.0}
 
     def why(**changes: object) -> str | None:
-        scene = Case(room(camera=camera() | changes), [])
-        return ptracer_image(Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, 4, False))
+        return ptracer_image(situation(Case(room(camera=camera() | changes), [])))
 
     assert why() is why(**lens) is why(far_clip=4.1) is None  # stock light tracing supports a pinhole's far plane
     assert "`thinlens`" in why(**lens | {"far_clip": 4.1})
@@ -342,7 +340,7 @@ def test_path_loses_light_reflected_by_masks():
     veil = {"type": "mask", "opacity": 0.4, "bsdf": {"type": "twosided", "bsdf": diffuse(0.7, 0.6, 0.3)}}
     pane = {"type": "rectangle", "to_world": transform(rotate=([1, 0, 0], -45)), "bsdf": veil}
     scene = Case(room(floor_shape=None, wall_shape=None, side_shape=None, pane=pane), [])
-    at = Situation.of(scene.scene, scene.scene.sensors()[0], scene.params, 4, False)
+    at = situation(scene)
     assert "reflected by masks" in path_image(at)
     assert prb_image(at) is None
     ours, path, prb = (scene.image(integrator(name, 4), 1, 256).sum() for name in ("reslrb", "path", "prb"))
@@ -438,16 +436,10 @@ def test_paths_are_compared_with_their_naive_ad_at_equal_seeds():
 def test_a_wrong_weight_of_camera_paths_is_found(monkeypatch: pytest.MonkeyPatch):
     """Beside camera paths, light paths keep their full weight. Naive AD has the same fault, but `path` does not."""
     monkeypatch.setattr("reslrb_cli.transport.walk.weight_of_connection", lambda *_: mi.Float(1))
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, "scene.options.size=8", "run.spp=64"])
-    made = Gradcheck(CheckSettings(config, estimators_of("stack(paths=both)"), 0, 8))
+    made = Gradcheck(CheckSettings(box("scene.options.size=8", "run.spp=64"), estimators_of("stack(paths=both)"), 0, 8))
     rows = made.run(lambda: False, lambda line: None)
     images = list(takewhile(lambda record: record.parameter is None, rows))
     assert [record.reference for record in images if record.holds is False] == [Reference.PATH]
-
-
-def test_camera_paths_have_one_estimator():
-    config = loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, "integrator.paths=camera"])
-    assert [case.label for case in all_estimators(config)] == ["reslrb:stack"]
 
 
 def test_moving_lamps_have_only_light_paths():
@@ -556,7 +548,7 @@ def test_stock_camera_paths_are_no_reference_behind_hidden_lamps(shape: str):
     sign = lamp(radiance=rgb(1, 1, 1)) | {"to_world": transform(translate=[0.5, 0.2, 1.6], scale=0.5)}
     made = Case(room(thing=behind, sign=sign), [])
     for paths in ("light", "camera", "both"):
-        at = Situation.of(made.scene, made.scene.sensors()[0], made.params, 4, False, paths=paths)
+        at = situation(made, paths=paths)
         assert path_image(at) is prb_image(at) is None
         at = replace(at, hide_emitters=True)
         reasons = [path_image(at), prb_image(at), prb_gradient(at, "wall.brdf_0.reflectance.value")]
@@ -571,27 +563,24 @@ def test_stock_camera_paths_are_no_reference_behind_hidden_lamps(shape: str):
     assert bool(compare(*images)) == (shape in ("cube", "rectangle"))
 
 
-def _lit(view: str, **more: Any) -> Situation:
-    """Return the situation of a small room seen by a sensor. The paths `view` decide which references are valid."""
-    made = Case(room(**more), [])
-    return Situation.of(made.scene, made.scene.sensors()[0], made.params, 4, False, paths=view)
-
-
 def test_references_depend_on_the_paths():
+    def lit(paths: str, **more: Any) -> Situation:
+        return situation(Case(room(**more), []), paths=paths)
+
     mirror = {"wall": {"type": "twosided", "bsdf": {"type": "conductor"}}}
-    assert prb_image(_lit("light", **mirror)) is not None
-    assert ptracer_image(_lit("light", **mirror)) is None
+    assert prb_image(lit("light", **mirror)) is not None
+    assert ptracer_image(lit("light", **mirror)) is None
     for paths in ("camera", "both"):
-        assert prb_image(_lit(paths, **mirror)) is None
-        assert ptracer_image(_lit(paths, **mirror)) is not None
+        assert prb_image(lit(paths, **mirror)) is None
+        assert ptracer_image(lit(paths, **mirror)) is not None
     ball = {"ball": {"type": "sphere", "radius": 0.1, "center": [0, 9, 0], "bsdf": {"type": "dielectric"}}}
     bulb = {"bulb": {"type": "point", "position": [0, 8, 0], "intensity": rgb(1, 1, 1)}}
-    assert prb_image(_lit("both", **ball, **bulb)) is not None
-    assert ptracer_image(_lit("both", **ball, **bulb)) is None
-    assert prb_image(_lit("camera", **ball, **bulb)) is None
-    assert ptracer_image(_lit("camera", **ball, **bulb)) is not None
-    assert list(of_image(_lit("light"))) == [Reference.PTRACER, Reference.PRB]
-    assert list(of_image(_lit("both"))) == [Reference.PRB, Reference.PTRACER]
+    assert prb_image(lit("both", **ball, **bulb)) is not None
+    assert ptracer_image(lit("both", **ball, **bulb)) is None
+    assert prb_image(lit("camera", **ball, **bulb)) is None
+    assert ptracer_image(lit("camera", **ball, **bulb)) is not None
+    assert list(of_image(lit("light"))) == [Reference.PTRACER, Reference.PRB]
+    assert list(of_image(lit("both"))) == [Reference.PRB, Reference.PTRACER]
 
 
 # Gradcheck of parameters that move light: which references count, and which estimators take part.
@@ -663,8 +652,7 @@ def test_references_of_moving_scenes():
     case = Case(scene, [])
 
     def at(*moved: str) -> Situation:
-        sensor = case.scene.sensors()[0]
-        return Situation.of(case.scene, sensor, case.params, 4, True, True, moved)
+        return situation(case, 4, True, True, moved)
 
     assert moves_light(case.params, "ball.to_world")
     assert moves_light(case.params, "lamp.translation")
