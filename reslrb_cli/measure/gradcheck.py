@@ -96,12 +96,10 @@ class Gradcheck:
         shown += [(listed.label, parts.ways[listed.label]) for listed in parts.listed if listed.type == "custom"]
         images = [(label, way, parts.images[way][0]) for label, way in shown]
         found = [Row(None, label, one, Kind.IMAGE, way) for label, way, one in images if one is not None]
-        # With guiding, a quasi-random sequence or measured pixels, paths differ from those of naive AD at equal seeds.
-        drawn, options = (
-            ("guiding", "sequence", "pixels"),
-            {label: config.integrator.options() for label, config in self.settings.configs.items()},
-        )
-        plain = [label for label, own in options.items() if all(own.get(n, PLAIN[n]) == PLAIN[n] for n in drawn)]
+        # Guiding, a quasi-random sequence and measured pixels make paths differ from those of naive AD at equal seeds.
+        usual = {name: PLAIN[name] for name in ("guiding", "sequence", "pixels")}
+        options = {label: config.integrator.options() for label, config in self.settings.configs.items()}
+        plain = [label for label, own in options.items() if usual == usual | {k: own[k] for k in usual if k in own}]
         for key in parts.case.keys:
             for listed in parts.listed:
                 ours = listed.type == "reslrb" and listed.label in plain
