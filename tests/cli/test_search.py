@@ -357,6 +357,15 @@ def test_a_fresh_run_has_no_caches(monkeypatch):
     assert jobs.call([], sweep.Interrupts(), jobs.RunSlot()) == (0, str(["the user's"] * 4))
 
 
+def test_memory_now_and_at_most(monkeypatch):
+    """The process frees 64 MiB at once."""
+    monkeypatch.setattr(jobs, "_PROGRAM", "x = bytearray(1 << 26); del x; import time; time.sleep(0.4)")
+    slot, seen = jobs.RunSlot(), []
+    slot.show = lambda: seen.append(slot.peak - slot.resident)
+    assert jobs.call([], sweep.Interrupts(), slot)[0] == 0
+    assert max(seen) > 1 << 25
+
+
 def test_a_run_that_must_end_is_ended(monkeypatch):
     """Because another run has failed: nobody has sent a signal to the sweep."""
     monkeypatch.setattr(jobs, "_PROGRAM", "import time; print('at work', flush=True); time.sleep(60)")

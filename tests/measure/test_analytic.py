@@ -29,6 +29,7 @@ from reslrb_cli.measure.scenes.analytic import (
     refraction_scene,
     slab_scene,
 )
+from reslrb_cli.measure.scenes.moving import displacement, number, pose
 from reslrb_cli.measure.scenes.small import SIZE, diffuse, pinhole, rectangle, rgb
 from reslrb_cli.records.measurements import Verdict
 from reslrb_cli.transport.walk import Segment
@@ -182,6 +183,19 @@ def gradients(motion: KnownMotion, count: int = 8, spp: int = 128) -> np.ndarray
     case = motion.scene.setup()
     case.weigh(motion.weights)
     return case.gradients(integrator("reslrb", **motion.scene.options, estimator="stack"), seeds(count), spp)
+
+
+def test_moves_follow_their_amplitudes(llvm: str):
+    """The degrees of freedom of a pose act in their order, and turns and sizes about the pivot."""
+    amplitudes = [mi.Float(0.5), mi.Float(np.pi / 2), mi.Float(1.0)]
+    move = pose("lamp.position", ("tx", "rz", "s"), (1, 0, 0))
+    np.testing.assert_allclose(move.value(mi.Point3f(2, 0, 0), amplitudes).numpy().ravel(), [1, 3, 0], atol=1e-6)
+    turned = move.value(mi.AffineTransform4f().translate([2, 0, 0]), amplitudes) @ mi.Point3f(0, 0, 0)
+    np.testing.assert_allclose(turned.numpy().ravel(), [1, 3, 0], atol=1e-6)
+    moved = displacement("top.vertex_positions", np.array([[[1, 0, 0]], [[0, 2, 0]], [[0, 0, 3]]]))
+    np.testing.assert_allclose(moved.value(mi.Float(1, 1, 1), amplitudes), [1.5, 1 + np.pi, 4], rtol=1e-6)
+    assert (move.size, moved.size, number("a").size) == (3, 3, 1)
+    assert number("a").value(mi.Float(0.25), amplitudes[:1])[0] == 0.75
 
 
 @pytest.mark.parametrize("name", a_few(MOTIONS, ()))

@@ -19,9 +19,9 @@ from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, d
 from reslrb_cli.measure.extreme import MOST_CASES, WAYS, run_case
 from reslrb_cli.measure.gradients import integrator, seeds
 from reslrb_cli.measure.scenes import case as scenes_case
-from reslrb_cli.measure.scenes.case import Differences
+from reslrb_cli.measure.scenes.case import Differences, ReferenceGradients
 from reslrb_cli.measure.scenes.catalogue import CASES, TAGGED
-from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Verdict
+from reslrb_cli.records.measurements import Comparison, GradcheckRecord, Reference, Verdict
 
 #: The case of the default suite: a lamp of which no point can be drawn. test_replay.py has values that are not finite,
 #: and test_plan.py scenes without a connection. Tests of roulette with its fault, and of a furnace, stand below.
@@ -137,6 +137,18 @@ def test_along_the_border_camera_paths_are_compared_with_a_complete_reference():
     assert {record.reference.value for record in records} == {"walk_ad", "prb", "path"}
     assert {record.options["paths"] for record in records} == {"both"}
     assert all(record.holds for record in records)
+
+
+def test_refused_entries_are_counted_at_each_seed(monkeypatch: pytest.MonkeyPatch):
+    """Three entries of dL/dI are not finite."""
+    ones = np.ones((3, 6))
+    monkeypatch.setattr(scenes_case.Stock, "samples", lambda *_: ReferenceGradients(ones))
+    case = replace(CASES["nan_loss"], naive=False, image="", seeds=3)
+    for refused, verdict in (([3, 3, 3], Verdict.HOLDS), ([3, 2, 3], Verdict.FAILS)):
+        steps = ones, np.ones((3, 16, 16, 3)), refused
+        monkeypatch.setattr(extreme, "_steps", lambda *_, steps=steps: steps)
+        *_, record = run_case(case, ["stack"])
+        assert (record.parameter, record.reference, record.verdict) == (None, Reference.ANALYTIC, verdict)
 
 
 def test_moving_cases_use_only_light_paths():

@@ -40,7 +40,7 @@ from reslrb_cli.measure.gradients import (
     smooth_weights,
 )
 from reslrb_cli.measure.methods import all_estimators
-from reslrb_cli.measure.participants import CheckSettings, Participants
+from reslrb_cli.measure.participants import CheckSettings, Participants, Way
 from reslrb_cli.measure.references import (
     Situation,
     of_image,
@@ -471,6 +471,12 @@ def test_differences_of_moving_shapes_have_the_paths_of_a_run(asked: str, paths:
         tracer = parts.integrators[parts._tracer(kind, of)]
         assert isinstance(tracer, LightTracer)
         assert tracer.paths == wanted
+
+
+def test_different_paths_have_different_names():
+    ways = [Way(), Way("camera"), Way("both", 0.25), Way("both", 0.5)]
+    assert len({way.named("walk_ad") for way in ways}) == len(ways)
+    assert ways[0].named("walk_ad") == "walk_ad"
 
 
 def test_an_estimator_without_camera_paths_names_its_own():

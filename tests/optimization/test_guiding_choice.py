@@ -467,11 +467,19 @@ def test_few_entries_are_measured_more_often() -> None:
     assert few.rounds > many.rounds
 
 
-@pytest.mark.parametrize("alone", [False, True])
-@pytest.mark.parametrize(("image", "on"), [(3.0, False), (0.9, True)])
-def test_the_image_must_not_lose_efficiency(image: float, on: bool, alone: bool) -> None:
+@pytest.mark.parametrize(
+    ("world", "on"),
+    [
+        (World(0.05, 1.1, image=3.0), False),
+        (World(0.05, 1.1, image=0.9), True),
+        (World(0.05, 1.1, image=3.0, alone=True), False),
+        (World(0.05, 1.1, image=0.9, alone=True), True),
+        (World(0.05, 0.2, image=1.0, image_time=1.5, alone=True), False),  # less time in all, and more for the image
+    ],
+)
+def test_the_image_must_not_lose_efficiency(world: World, on: bool) -> None:
     """This holds for images of the gradient's samples, and for images with their own samples."""
-    found = World(0.05, 1.1, image=image, alone=alone).race(guides=False)
+    found = world.race(guides=False)
     assert found.other == on
     assert found.gain is not None
     assert found.gain[1] > 1
