@@ -85,6 +85,8 @@ class Gradcheck:
         self.participants, self.file = Participants(settings), file or DrawsFile()
         self.draws: dict[Name, list[np.ndarray]] = {}
         self._about: dict[Name, dict[str, Any]] = {}
+        #: Rounding errors after each sample, so that fewer seeds than on file have the same results as without a file.
+        self._roundings: dict[Name, list[dict[str, float]]] = {}
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -165,8 +167,13 @@ class Gradcheck:
         found, stored = self.file.draws(about), self.file.stored(about)
         if found is None or stored is None or found.seeds.tolist() != list(seeds(len(found))):
             return []
-        self.participants.restore(name[1], stored.facts)
-        return list(found.values)[: self.seeds]
+        self._roundings[name] = roundings = list(stored.facts.get("roundings", ()))
+        if len(roundings) != len(found):  # the file is of an earlier version
+            self._roundings[name] = []
+            return []
+        rows = list(found.values)[: self.seeds]
+        self.participants.restore(name[1], stored.facts["steps"], roundings[len(rows) - 1])
+        return rows
 
     def _take(self, name: Name, seed: int) -> None:
         """Take a sample, and add it to the file with the facts that belong to it."""
@@ -175,7 +182,9 @@ class Gradcheck:
         self.draws[name].append(self.participants.sample(*name, seed).astype(np.float32))
         if (about := self._about.get(name)) is not None:
             self.file.add(about, Draws.of(about["purpose"], self.draws[name][-1], [seed]))
-            self.file.store(about, StoredResults(self.participants.facts(name[1]), {}))
+            self._roundings.setdefault(name, []).append(dict(self.participants.case.roundings))
+            facts = {"steps": self.participants.steps(name[1]), "roundings": self._roundings[name]}
+            self.file.store(about, StoredResults(facts, {}))
 
     def records(self, interrupted: bool = False) -> list[GradcheckRecord]:
         """Return the comparisons of the samples so far, in the order of `rows`, and the parameters without a stock

@@ -381,16 +381,15 @@ class Participants:
         own = {"integrator": options, "spp": self.spp, "known": self.known, "masked": self.masked, "arrays": digest}
         return situation(config, mi.variant(), purpose=f"gradcheck, {kind} {of}", **own)
 
-    def facts(self, of: str) -> dict[str, Any]:
-        """Return the finite-difference steps and rounding errors that the samples of `of` have determined."""
-        steps = [(direction.step, direction.truncation) for direction in self.directions.get(of, ())]
-        return {"steps": steps, "rounding": dict(self.case.roundings)}
+    def steps(self, of: str) -> list[tuple[float, float]]:
+        """Return the finite-difference steps of a parameter, with their truncation errors."""
+        return [(direction.step, direction.truncation) for direction in self.directions.get(of, ())]
 
-    def restore(self, of: str, facts: Mapping[str, Any]) -> None:
-        """Set the steps and rounding errors that `facts` returned."""
-        for number, (step, truncation) in enumerate(facts["steps"]):
+    def restore(self, of: str, steps: Sequence[tuple[float, float]], roundings: Mapping[str, float]) -> None:
+        """Set the steps and rounding errors that earlier samples have determined."""
+        for number, (step, truncation) in enumerate(steps):
             self.directions[of][number] = replace(self.directions[of][number], step=step, truncation=truncation)
-        for key, value in facts["rounding"].items():
+        for key, value in roundings.items():
             self.case.roundings[key] = max(self.case.rounding(key), value)
 
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
