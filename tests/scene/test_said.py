@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 from cli.every_plugin import ROWS, Row, write_files
 from golden import said
 
+from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.scene.catalog import summarise
+from reslrb_cli.scene.edges import EdgeSet, edge_kinds
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.needs import blend_warning, camera_finds_all, scene_needs, stock_clip, usual_paths
+from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import find_movable_in_view, propose
 from reslrb_cli.scene.visibility import interior, sees_lamps, sees_specular
 
@@ -77,3 +84,77 @@ def test_every_plugin(row: Row, plain: dict[str, Any]) -> None:
     Path("scene.xml").write_text(row.xml())
     found = described("scene.xml")
     said.check(f"scene with {row.name}", {key: value for key, value in found.items() if plain.get(key) != value})
+
+
+# Motions, heightmaps and edges of every shape.
+
+IDS = ("box", "inside_out", "ball", "tube", "disk", "sheet", "roof", "bulb", "spot", "sun")
+
+
+@pytest.fixture
+def solids(make_scene: Callable[..., Any]) -> Any:
+    """A scene with an object of every kind that can move. `roof` has no vertex normals, and two faces."""
+    T = mi.ScalarTransform4f
+    roof = mi.Mesh("roof", 4, 2, has_vertex_texcoords=True)
+    params = mi.traverse(roof)
+    params["vertex_positions"] = [-1, 0, 2, 1, 0, 2, 1, 1, 2.5, -1, -1, 2.8]
+    params["faces"], params["vertex_texcoords"] = [0, 1, 2, 0, 3, 1], [0, 0.5, 1, 0.5, 1, 1, 0, 0]
+    params.update()
+    turned = T().translate([1, 0.5, 2]).rotate([0, 1, 1], 20)
+    return make_scene(
+        box={"type": "cube", "to_world": turned.scale([0.3, 0.2, 0.4])},
+        inside_out={"type": "cube", "flip_normals": True, "to_world": T().translate([-2, 1, 1]).scale(0.3)},
+        ball={"type": "sphere", "center": [-1, 0, 1], "radius": 0.5},
+        tube={"type": "cylinder", "p0": [0, -1, 0], "p1": [0, -1, 0.5], "radius": 0.2},
+        disk={"type": "disk", "to_world": turned.scale(0.7)},
+        sheet={"type": "rectangle", "to_world": T().translate([0, 0, 0.5]).rotate([1, 0, 0], 30).scale(0.4)},
+        roof=roof,
+        bulb={"type": "point", "position": [0.5, 1, 4]},
+        spot={"type": "spot", "to_world": T().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0])},
+        sun={"type": "directional", "direction": [0, 0.6, -0.8]},
+    )
+
+
+def numbers(value: Any) -> Any:
+    """Return the numbers of an array of Dr.Jit, or of a transform, for comparison."""
+    return said.plain(np.array(getattr(value, "matrix", value) if "Transform" in type(value).__name__ else value))
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_motions(id: str, solids: Any) -> None:
+    free = {"sun": ["rotation"], "bulb": ["translation"], "spot": ["translation", "rotation"]}
+    specs = [{"motion": {"of": id, "free": free.get(id, ["translation", "rotation", "scale"])}}]
+    if id in ("box", "inside_out", "roof"):
+        specs.append({"heightmap": {"mesh": id, "resolution": [3, 2]}})
+    selection = select_parameters(solids, [ParameterSpec(**spec) for spec in specs], "c.yaml")
+    deformation = selection.deformation
+    found: dict[str, Any] = {"extents": deformation.extents, "quantities": deformation.quantities}
+    found["kinds"] = {key: selection.kind(key) for key in selection.keys}
+    given = {"translation": [0.1, -0.2, 0.3], "rotation": [10, 20, 30], "scale": 1.5,
+             "heightmap": np.arange(6).reshape(2, 3, 1) / 10}  # fmt: skip
+    selection.set_arrays({key: np.float32(given[key.rpartition(".")[2]]) for key in selection.keys})
+    found["placed"] = {key: numbers(selection.params[key]) for key in selection.scene_keys}
+    for value in deformation.values.values():
+        dr.enable_grad(value)
+    selection.hand_over(dict(deformation.values))
+    for key in selection.scene_keys:
+        leaf = selection.params[key]
+        dr.set_grad(leaf, 0)
+        dr.backward(dr.sum(dr.square(dr.ravel(leaf.matrix if hasattr(leaf, "matrix") else leaf))))
+    selection.collect()
+    found["gradients"] = {key: numbers(dr.grad(value)) for key, value in deformation.values.items()}
+    said.check(f"motion of {id}", found)
+
+
+@pytest.mark.parametrize("id", IDS[:7])
+def test_edges(id: str, solids: Any) -> None:
+    """Lamps move, so that no random rays decide which edges count."""
+    [shape] = [shape for shape in solids.shapes() if shape.id() == id]
+    edges = EdgeSet((shape,), solids, lamps_move=True)
+    table = edges.now()
+    names = [each.name for each in fields(table) if each.name not in ("shape", "balls", "chains", "faces")]
+    found = {name: numbers(getattr(table, name)) for name in names}
+    found["occluders"] = [other.id() for other in edges.occluders]
+    found["balls"] = [[numbers(ball.center), numbers(ball.radius)] for ball in table.balls]
+    found["kinds"] = sorted(edge_kinds([shape]))
+    said.check(f"edges of {id}", found)
