@@ -278,9 +278,9 @@ def test_the_truth_is_within_spreads_with_the_noise_of_the_target(folder, name, 
 # Noise of the images biases gradients of losses that are not quadratic in the image.
 
 
-def write_target(folder) -> None:
+def write_target(folder, spp: int = 16384) -> None:
     """Write the image of the scene with few errors as `target.exr`."""
-    problem = assemble(load(folder / "toy.yaml", ["target.render.spp=16384"]))
+    problem = assemble(load(folder / "toy.yaml", [f"target.render.spp={spp}"]))
     mi.Bitmap(np.array(problem.views[0].target)).write(str(folder / "target.exr"))
 
 
@@ -294,7 +294,7 @@ def with_a_file(loss: str, spp: int, iterations: int = 150) -> Toy:
 @pytest.mark.parametrize(("loss", "is_biased"), [("l1", True), ("l2", False), ("relative_l2", False)])
 def test_only_losses_that_noise_biases_have_a_bias(loss, is_biased, folder):
     """The bias enters B along directions and by entry."""
-    write_target(folder)
+    write_target(folder, 1024)
     settings = [*with_a_file(loss, 64).settings, "parameters=[{key: wall.reflectance.value, bounds: [0, 1]}]"]
     problem = assemble(load(folder / "toy.yaml", settings))
     problem.apply()

@@ -85,7 +85,7 @@ class Chromium:
         while time.monotonic() < deadline:
             if self.evaluate(expression):
                 return True
-            time.sleep(0.1)
+            time.sleep(0.02)
         return False
 
     def screenshot(self, path: Path) -> None:

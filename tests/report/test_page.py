@@ -448,13 +448,13 @@ def test_the_border_is_dragged_on_the_picture_and_a_click_enlarges_it(chromium, 
 
 def test_a_page_in_progress_keeps_the_reader_s_place(chromium, tmp_path, monkeypatch):
     """It reloads itself, but not while a picture is enlarged, and keeps the border of the pictures."""
-    monkeypatch.setattr("reslrb_cli.report.page.REFRESH_SECONDS", 1)
+    monkeypatch.setattr("reslrb_cli.report.page.REFRESH_SECONDS", 0.5)
     page = write_report(make_run(tmp_path / "run"), {"status": "running", "views": [{"sensor": 0, "shown": 1.0}]})
     chromium.open(page, 1280)
     chromium.evaluate("document.querySelector('.compare input').value = 30")
     chromium.evaluate("document.querySelector('.compare input').dispatchEvent(new Event('input'))")
     chromium.evaluate("window.seen = 1; document.querySelector('.stage').click()")
-    time.sleep(1.3)
+    time.sleep(0.7)
     assert chromium.evaluate("[window.seen, document.querySelectorAll('dialog').length]") == [1, 1]
     chromium.evaluate("document.querySelector('dialog').click()")
     assert chromium.wait_for("window.seen != 1 && document.readyState == 'complete'", 10)
