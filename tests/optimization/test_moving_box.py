@@ -56,8 +56,8 @@ def find_box(path: Path, *sets: tuple[str, Any]) -> list[float]:
 def test_auto_finds_a_box_within_a_few_steps(llvm: str, tmp_path: Path) -> None:
     """The box is AWAY from its place, and 7 pixels wide."""
     path = write_experiment(tmp_path, "area")
-    sets = [("parameters[0].initial", [AWAY, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 64)]
-    far = find_box(path, *sets, ("target.render.spp", 512))
+    sets = [("parameters[0].initial", [AWAY, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 32)]
+    far = find_box(path, *sets, ("target.render.spp", 256))
     assert far[0] == pytest.approx(AWAY / SIZE)
     assert max(far[6:]) < 0.02
     assert max(far[10:]) < 0.01
@@ -71,8 +71,8 @@ def test_steps_are_halved_until_the_loss_does_not_rise(
     steps = Block.steps
     monkeypatch.setattr(Block, "steps", lambda block, now: 4 * steps(block, now))
     path = write_experiment(tmp_path, "area")
-    sets = [("parameters[0].initial", [AWAY / 4, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 64)]
-    assert find_box(path, *sets, ("run.iterations", 20))[-1] < 0.02
+    sets = [("parameters[0].initial", [AWAY / 4, 0, 0]), ("scene.size", [32, 32]), ("run.spp", 32)]
+    assert find_box(path, *sets, ("run.iterations", 12), ("target.render.spp", 512))[-1] < 0.02
 
 
 def test_init_offers_to_move_the_box(llvm: str, tmp_path: Path) -> None:
