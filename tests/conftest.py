@@ -48,6 +48,30 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in left_out]
 
 
+#: Diagrams that earlier tests drew, by the labels of their axes.
+DRAWN: dict[tuple[str, str], str] = {}
+
+
+def drawn_once(panel: Any) -> str:
+    """Return the first diagram that was drawn with these labels, for all sets of curves with data. Drawing takes longer
+    than these runs.
+    """
+    from reslrb_cli.report.page.layout import diagram
+
+    if not panel.shown():
+        return diagram(panel)
+    if (panel.x, panel.y) not in DRAWN:
+        DRAWN[panel.x, panel.y] = diagram(panel)
+    return DRAWN[panel.x, panel.y]
+
+
+@pytest.fixture(autouse=True)
+def _draw_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw each diagram of runs once, except in the tests of pages, which check the diagrams."""
+    if "report" not in request.path.parts and "reslrb_cli.report" in sys.modules:
+        monkeypatch.setattr("reslrb_cli.report.page.values.diagram", drawn_once)
+
+
 @pytest.fixture(scope="session")
 def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
     executable = find_chromium()

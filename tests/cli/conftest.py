@@ -10,24 +10,7 @@ from cli.tiny import write_experiment
 
 from reslrb_cli.cli import main
 from reslrb_cli.cli.optimize import Progress
-from reslrb_cli.report.page import values
-from reslrb_cli.report.page.layout import diagram
-from reslrb_cli.report.plots import Panel
 from reslrb_cli.runs import recorder as recording
-
-#: Diagrams that earlier tests drew, by the labels of their axes.
-DRAWN: dict[tuple[str, str], str] = {}
-
-
-def drawn_once(panel: Panel) -> str:
-    """Return the first diagram that was drawn with these labels, for all sets of curves with data. Drawing takes longer
-    than these runs.
-    """
-    if not panel.shown():
-        return diagram(panel)
-    if (panel.x, panel.y) not in DRAWN:
-        DRAWN[panel.x, panel.y] = diagram(panel)
-    return DRAWN[panel.x, panel.y]
 
 
 @pytest.fixture(autouse=True)
@@ -36,8 +19,6 @@ def _own_log_and_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: py
     closes.
     """
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path_factory.mktemp("cache")))
-    # The tests in tests/report check the diagrams.
-    monkeypatch.setattr(values, "diagram", drawn_once)
     logger = logging.getLogger("reslrb_cli")
     logger.handlers.clear()
     yield

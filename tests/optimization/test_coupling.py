@@ -315,7 +315,7 @@ def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path, monkeyp
     write_sample(tmp_path, 3, 16)
     keys = list(MAPS)[1:]
     problem = assembled(tmp_path, keys)
-    (maps,), left = measure_maps(LossCurvature(problem, 192), 0.05, 128, lambda: True)
+    (maps,), left = measure_maps(LossCurvature(problem, 512), 0.05, 512, lambda: True)
     assert not left
     assert maps.noise < MOST_NOISE
     assert [name for name, _ in maps.names] == keys
@@ -326,7 +326,7 @@ def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path, monkeyp
             vector = np.eye(9)[texel] * value
             changed = (value - 0.05 * vector).reshape(3, 3, 1)
             changes.append(ParameterChange({key: changed}, -0.05, [ParameterDirection(key, vector)]))
-    curvature = LossCurvature(problem, 192, of_target=False, round=5)
+    curvature = LossCurvature(problem, 512, of_target=False, round=5)
     curvature.along(changes, lambda: True)
     a, b = curvature.slopes
     H = 0.5 * (a @ b.T + b @ a.T).reshape(2, 9, 2, 9)
@@ -338,7 +338,7 @@ def test_maps_have_the_curvature_of_differences_by_texel(llvm, tmp_path, monkeyp
     error = (maps.matrix - expected) / np.outer(scale, scale)
     assert rms(error) < 2.5 * maps.noise, error
     assert np.abs(expected / np.outer(scale, scale))[:, 0, 1].max() > 0.3
-    assert measure_maps(curvature, 0.05, 192, lambda: False) == ([], set(keys))
+    assert measure_maps(curvature, 0.05, 512, lambda: False) == ([], set(keys))
     # Noise that is too large is measured again, up to a limit of the samples.
     spps = []
     monkeypatch.setattr(coupling, "MOST_NOISE", 0.0)
