@@ -57,7 +57,8 @@ def test_a_scene_end_to_end(folder: Path) -> None:
 
 @pytest.mark.long
 def test_the_loss_reveals_correlated_samples(folder: Path) -> None:
-    args = ["--objective", "loss", "--rounds", "256", "--json", "c.jsonl", "--set", "run.spp=4", "--set", "loss.type=l2"]
+    args = ["--objective", "loss", "--rounds", "256", "--json", "c.jsonl"]
+    args += ["--set", "run.spp=4", "--set", "loss.type=l2"]
     cases = "reslrb:stack(adjoint=correlated),reslrb:stack(adjoint=independent)"
     sentence = done("convergence", "tiny.yaml", *args, "--integrators", cases).stdout.splitlines()[-1]
     methods = [line for line in measured(folder / "c.jsonl") if line["kind"] == "method"]
