@@ -305,6 +305,13 @@ def test_an_ended_run_keeps_its_status(tmp_path):
     assert (before["status"], before["error"]) == ("failed", "a line")
 
 
+def test_a_manifest_is_json_without_extensions(tmp_path):
+    manifest = make_manifest()
+    manifest.results = {"loss": float("nan")}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        manifest.write(tmp_path)
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"program": "other"}', "[" * 100_000, "\udcff"])
 def test_foreign_manifests(tmp_path, text):
     (tmp_path / MANIFEST_FILE).write_bytes(text.encode(errors="surrogateescape"))

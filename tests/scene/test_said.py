@@ -158,3 +158,48 @@ def test_edges(id: str, solids: Any) -> None:
     found["balls"] = [[numbers(ball.center), numbers(ball.radius)] for ball in table.balls]
     found["kinds"] = sorted(edge_kinds([shape]))
     said.check(f"edges of {id}", found)
+
+
+def test_lamps(make_scene: Callable[..., Any]) -> None:
+    """Lamps of every shape, with a texture, with one colour, and along the normal."""
+    texture = {
+        "type": "bitmap",
+        "raw": True,
+        "data": mi.TensorXf(np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3)),
+    }
+    kinds = {
+        "plain": {"type": "area"},
+        "textured": {"type": "area", "radiance": texture},
+        "parallel": {"type": "directionalarea"},
+    }
+    shapes = {"rectangle": {}, "disk": {}, "sphere": {"flip_normals": True}, "cylinder": {}, "cube": {}}
+    lamps = {
+        f"{shape}_{name}": {"type": shape, **options, "emitter": emitter}
+        for shape, options in shapes.items() for name, emitter in kinds.items()
+    }  # fmt: skip
+    scene = make_scene(**lamps)
+    names = ("is_sphere", "surrounds", "is_beam", "faces_by_area", "has_faces")
+    found = {lamp.shape.id(): [said.plain(lamp), [getattr(lamp, name) for name in names]]
+             for lamp in SceneGraph.of(scene).find_lamps(scene)}  # fmt: skip
+    said.check("lamps", found)
+
+
+@pytest.mark.usefixtures("spectral")
+@pytest.mark.parametrize("rough", [{}, {"alpha": 0.2}, {"alpha": 0.3, "distribution": "ggx", "ext_ior": 1.2}])
+def test_glass_with_dispersion(rough: dict[str, Any]) -> None:
+    """Values, densities and samples for directions on both sides, in both modes of transport."""
+    glass = mi.load_dict({"type": "dispersivedielectric", "material": "F2", **rough})
+    si = dr.zeros(mi.SurfaceInteraction3f, 6)
+    si.wi = dr.normalize(mi.Vector3f([0, 0.3, 0.6, 0.2, -0.5, 0.9], [0.1, 0, 0.2, 0.4, 0.1, 0], [1, 1, 1, -1, -1, 0.5]))
+    si.wavelengths = mi.Spectrum(450, 520, 590, 660)
+    wo = dr.normalize(
+        mi.Vector3f([0, -0.2, -0.4, -0.1, 0.3, -0.9], [-0.1, 0, -0.1, -0.3, 0, 0], [1, -1, -1, 1, -1, 0.5])
+    )
+    found: dict[str, Any] = {"text": str(glass), "indices": [np.array(each).tolist() for each in glass.indices(si)]}
+    for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+        context = mi.BSDFContext(mode)
+        value, density = glass.eval_pdf(context, si, wo)
+        bs, weight = glass.sample(context, si, mi.Float(0.05, 0.3, 0.55, 0.8, 0.95, 0.5), mi.Point2f(0.3, 0.7))
+        parts = (value, density, weight, bs.wo, bs.pdf, bs.eta, mi.Float(bs.sampled_type))
+        found[str(mode)] = [np.array(each, np.float64).round(5).tolist() for each in parts]
+    said.check(f"glass with dispersion {rough}", found)

@@ -1,0 +1,242 @@
+"""Results of small functions at their bounds, as a table of calls (`said.check`)."""
+
+# ruff: noqa: F401  # the table uses the modules
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from golden import said
+from kit import work_in
+from records.test_metrics import make_record
+
+from reslrb_cli import errors
+from reslrb_cli.cli import init, inspect, jobs, options, render, serve, terminal
+from reslrb_cli.cluster import connection
+from reslrb_cli.config.loader import parse_override
+from reslrb_cli.records import (
+    decisions,
+    images,
+    lock,
+    measurement_files,
+    measurements,
+    metrics,
+    run_folder,
+    sweeps,
+    tree,
+)
+from reslrb_cli.runs import log, loggers, prepare, search, workshop
+from reslrb_cli.runs import sweep as planned
+from reslrb_cli.scene import cameras, catalog, deformation, edges, graph, proposal, rays, upsampling, values, visibility
+from reslrb_cli.scene import export as exporting
+from reslrb_cli.scene import images as pictures
+
+#: Expressions. Names are those of modules here.
+CALLS = """
+decisions.Decision(setting="a", value="b", why="c").line(True)
+decisions.Decision(setting="a", value="b", why="c", seconds=1.25).line(True)
+decisions.Decision(setting="a", value="b", why="c", seconds=1.25, cached=True).line(True)
+decisions.Decision(setting="a", value="b", why="c", seconds=1.25).line()
+[images.file_stem(key) for key in ("a.b-c_d", "a b", "a/b", "ä", "x" * 180, "x" * 181, "x y" * 90)]
+[images._place(name) for name in ("R", "A", "B", "0", "10", "Z", "ch1")]
+images.in_range(np.array([1.0, 2, 3]), 1, 3), images.in_range(np.array([2.0]), 2, 2)
+images.finite_range([np.array([1.0, np.nan]), np.array([-2.0, np.inf])]), images.finite_range([])
+images.luminance(np.arange(12.0).reshape(1, 3, 4)), images.luminance(np.arange(6.0).reshape(1, 3, 2))
+images.as_bytes(np.array([[[0.0, 0.5, 1.5, 9], [np.nan, -1, np.inf, 9]]])), images.as_bytes(np.full((1, 1, 2), 0.2))
+[lock.Holder.from_json(data) for data in (None, {}, {"host": "a", "pid": "x", "boot": None, "locked": False})]
+str(lock.Holder("a", 3, None, False))
+measurement_files._finite("1e999"), measurement_files._finite("2.5"), measurement_files._command()[0]
+measurements.Spread.of([3, 1, 2]), measurements.Band.of([3.0, 1.0]), measurements.Band.of([])
+[measurements._percent(share) for share in (0.0, 0.0994, 0.0995, 0.1, 0.5, 1.234)]
+[round(measurements.student(n, d), 3) for n, d in ((2, 1), (4, 1), (4, 3), (64, 3))]
+[[share, error, *judged(share, error)] for share in (None, 0.0, 0.049, 0.051, 0.3, 0.52, 0.9) for error in (0.001, 0.029, 0.031, 0.2)]
+[missing(share, 0.01, n).line() for share in (None, 0.0, 5e-5, 0.3) for n in (0, 2, 8)]
+missing(0.3, None, 8).line(), missing(0.3, None, 8).percent(), missing(0.3, 0.02, 1).margin
+[missing(0.3, 0.01).is_reduced_to(missing(other, error)) for other, error in ((0.2, 0.01), (0.28, 0.01), (0.3, 0.1), (None, None))]
+missing(0.3, 0.01).is_reduced_to(None), missing(None, None).is_reduced_to(missing(0.3, 0.01))
+[metrics.finite({"a": [1.0, math.inf, (math.nan, 2)], "b": "x"}), metrics.finite(math.inf, str)]
+[metrics._iteration_of(line) for line in (b'{"iteration": 3}', b'{"iteration": 3}\\n', b'{"iteration": "3"}\\n', b"[1]\\n", b"{}\\n")]
+tally(metrics.NonFiniteTally(), dict(nonfinite=3, nonfinite_by_parameter={"a": 2}), dict(nonfinite=0), dict(nonfinite=2))
+tally(metrics.RegularizedTally(), dict(regularized=costs({"a": 1})), dict(regularized=costs({"a": 0})), dict())
+tally(metrics.RegularizedTally(), dict()), tally(metrics.NonFiniteTally())
+make_record(loss=math.nan, held_out=None).to_json()
+[run_folder.workshop_file(name) for name in ("Light of 0.5 degrees", "index +0.005", "a/b")]
+[run_folder._sets_initial(parse_override(text)) for text in ("run.spp=4", "parameters=[{key: a}]", "parameters=[{initial: 3}]", "parameters[0]={initial: 3}", "parameters[0].initial=3", "parameters[0].initial.run=a", "parameters[0].key=a")]
+run_folder.exposed(np.ones((1, 1, 4)), np.array([2.0, 3, 4]), 3), run_folder.exposed(np.ones((1, 1, 2)), 2.0, 1)
+[sweeps.in_words(value) for value in (0.1, 1e-5, 0.1234567, 3, True, None, "a b", "a: b", "reslrb:stack(paths=both)", {"a": [1, 2.5]}, [])]
+sweeps.short_keys(["a.b.c", "a.x.c", "d"]), sweeps.short_keys(["spp"]), sweeps.short_keys(["run.spp", "target.render.spp"])
+sweeps.label({"run.spp": 4, "optimizer.type": "sgd"}), sweeps.label({})
+[sweeps.run_name(sweeps.Combination(name, {}), 3) for name in ("a", "")]
+[str(sweeps.config_file(Path("s"), sweeps.Combination(name, {}))) for name in ("a", "")]
+[[plan.size, plan.keys, [(c.name, s) for c, s in plan.runs]] for plan in plans()]
+[planned._named(value) for value in (0.5, "a", {"type": "b", "c": [1, 2]}, {"x": True}, None)]
+planned.named({"a.b": 3}, []), planned.named({"a.b": 3}, [sweeps.Combination("B=3", {}), sweeps.Combination("b=3-2", {})])
+[search._from_optuna(planned.parse_vary(text, True), value) for text, value in (("a={low: 0.1, high: 0.2}", 0.123456), ("a={low: 0.1, high: 0.2}", 0.2000001), ("a={low: 1, high: 3}", 2), ("a=[[1], x]", "[1]"))]
+[prepare._shown(value) for value in (None, 3, "x" * 60, "x" * 61)]
+loggers._plain("a b/c.d-e_f(g)[0]")
+log.log_line("a\\nb", "ERROR")[26:]
+[workshop.allowed_error(fall, 2.0) for fall in (-1.0, 0.0, 0.02, 0.05, 0.2)]
+workshop.allowed_errors({}, "lens", {}), workshop.allowed_errors(errors_of(0.9, 0.8), "lens", dict(turn=1.0, index=0.005, distance=4.0))
+workshop.allowed_errors(errors_of(0.9, 0.89), "mirror", dict(turn=0.2, index=0.001)), workshop.allowed_errors(errors_of(0.9, 0.95), "lens", dict(turn=1.0, index=0.005))
+[workshop.picture_within(np.pad(np.ones((2, 3)), ((1, 2), (3, 1)))), workshop._unit(np.array([0.0, -2, 2]))]
+workshop.figures(CHECKS, CHECKS.T + 0.1), workshop.as_picture(CHECKS, CHECKS + 1, (slice(1, 7), slice(0, 8)))
+workshop.shift_between(np.roll(SPOT, (2, -3), (0, 1)), SPOT)
+[workshop.beam(POINTS, directions, 2.0) for directions in (towards(5.0), towards(5000.0), towards(900.0))]
+[inspect._counted(counts) for counts in ({}, {"A": 2, "B": 1})]
+[inspect._value(info(value, shape)) for value, shape in ((V([1.5], 1.5, 1, 2), ()), (V([1, 2], 1, 1, 2), (2,)), (V(None, 1, 0, 3), (4, 5, 3)), (V(None, 1, 0, 3), (4, 5, 1)), (V(None, 1, 0, 3), (7, 3)), (None, ()), (None, (3,)))]
+[inspect._flags(info(None, (), differentiable=d, discontinuous=c)) for d in (True, False) for c in (True, False)]
+inspect._reasons([info(None, (), obstacle=o) for o in ("b (1)", "b (2)", "a; c", "a")])
+[inspect.run_words(run) for run in ({}, {"status": "failed", "error": "x", "results": {"iterations": 3}}, {"status": "running"})]
+inspect.moving_lines([{"id": f"s{n}", "by": ["motion"] if n % 2 else ["motion", "heightmap"]} for n in range(25)], False)
+inspect.moving_lines([], False), inspect.moving_lines([{"id": "a", "by": ["motion"]}], True)
+inspect.parameter_lines([info(None, (), key=f"k{n:02d}") for n in range(40)], ["k35", "k3[01]"], False)
+inspect.parameter_lines([info(None, (), obstacle="x", bits=8), info(None, (), key="b", bits=16)], [], True)
+[init._word(text) for text in ("a.b", "12", "-1.5", "1e3", "a b", "x: y", "#", "../a/b")], [init._text(text) for text in ("a.b", "12", "ä b")]
+[init._path(Path(path), Path("/x/y/z")) for path in ("/x/y/z/a.xml", "/x/y/a.xml", "/x/a.xml", "/a.xml")]
+[init._entry(suggested(**more)) for more in ({}, {"bounds": "[0, 1]"}, {"resolution": (4, 3)})]
+[init._note(suggested(share=share, value=value, shape=shape)) for share in (0.0049, 0.005, 0.5) for value, shape in ((None, ()), (V([0.123456], 0, 0, 1), ()), (V(None, 1, 0.25, 3), (4, 5, 3)))]
+[init.choose_size(size, None) for size in ((100, 100), (128, 128), (129, 128), (4000, 1), (1920, 1080))], init.choose_size((4000, 3000), None, True)
+[options.allowance(240.0, number, "round") for number in (None, 1, 3)]
+[render.ExposureType().convert(value, None, None) for value in ("auto", None, "0.5", 2.0)]
+render.parse_values([" a = [1, 2] ", "b={file: x}"])
+[serve._number(value) for value in (1, 2.5, True, math.nan, math.inf, "1", None)]
+[bool(serve.LOCAL.fullmatch(host)) for host in ("localhost", "127.0.0.1:80", "[::1]:8", "LOCALHOST", "127.0.0.1.x", "a", "", "localhost:")]
+[terminal.tell(error) for error in (errors.ConfigError("a", "b", "c"), KeyboardInterrupt(), ZeroDivisionError())]
+[connection.Cluster.parse(text) for text in ("local:1", "local:1024", "tls://a:1", "tls://[::1]:65535")]
+[connection.Cluster.parse(text) for text in ("local:01025",)], 0
+[connection.Cluster.parse(text) for text in ("tls://a:65536",)], 0
+connection.Cluster(10**6).threads, connection.Cluster(address="a").threads
+[cameras.sensor_id(name) for name in ("a-b.c", "", "--", "é1")]
+[proposal.usual_bounds(info(value, (), key=key)) for key in ("a.reflectance.value", "m.vertex_color", "a.alpha.value", "a.eta.value", "a.eta", "a.nd", "a.Vd", "l.radiance.value", "sky.scale", "sky.turbidity", "a.weight.value", "a.other", "g.B1", "g.C1") for value in (None, V([0.5], 0.5, 0.5, 0.5), V([2], 2, 2, 2))]
+proposal.usual_bounds(info(None, ()), ("PrincipledThin", "eta")), proposal.usual_bounds(info(V([0.01], 0.01, 0.01, 0.01), (), key="g.C1"))
+[proposal._resolution(info(None, shape)) for shape in ((64, 64, 3), (65, 64, 3), (1000, 10, 3), (10, 1000, 1), (65, 1, 3), (70,))]
+proposal._means(np.arange(24.0).reshape(2, 4, 3), (2, 1)), proposal._means(np.array([[[np.nan], [1], [2], [3]]]), (2, 1))
+[visibility.widened(np.eye(5, dtype=bool), n) for n in (0, 1, 2)]
+[catalog.value_shape(value, halo) for value, halo in ((None, 0), (mi.Float(1), 0), (mi.Color3f(1), 0), (dr.zeros(mi.TensorXf, (2, 6, 3)), 1), (dr.zeros(mi.Float, 7), 0))]
+[values.first_entry(np.arange(size).reshape(shape), np.arange(size).reshape(shape) > 4) for size, shape in ((6, (6,)), (6, (2, 3)), (12, (2, 2, 3)), (3, (3,)))]
+values.resample(np.arange(12.0, dtype=np.float32).reshape(2, 2, 3), (4, 3)), values.resample(np.arange(48.0).reshape(4, 4, 3), (2, 2))
+[exporting.numbers(np.float32(number)) for number in (1, 0.1, 1e-30, 3e30)], exporting._free(Path("/h/a/b.png"), Path("/h"), {"a/b.png", "a/b-2.png"})
+exporting._free(Path("/other/B.png"), Path("/h"), {"assets/b.png"}), exporting._free(Path("/other/c.png"), Path("/h"), set())
+[exporting.same_values(*pair) for pair in ((1.0, 1.000009), (1.0, 1.0001), (np.ones(3), 1.0), (np.array([1, 2.0]), 1.0), (None, None), (np.ones(2), np.ones(3)), (0.0, 1e-36))]
+[pictures.turn(np.arange(6).reshape(2, 3), n) for n in range(1, 9)]
+pictures.decode_srgb(np.array([-0.1, 0.0, 0.04, 0.04045, 0.0405, 0.5, 1, 2]))
+[pictures.find_colours(names) for names in (["B", "G", "R"], ["Y"], ["x"], ["a.r", "a.g", "a.b", "Z"], ["a.R", "a.G", "a.B", "b.RGBA.R", "b.RGBA.G", "b.RGBA.B"], ["Y", "A"])]
+pictures._to_xyz([0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329])
+[pictures._ends(data) for data in (b"\\xff\\xd8\\xff\\xd9", b"\\xff\\xd8\\xff\\xe0\\x00\\x04\\xff\\xd9", b"\\xff\\xd8\\xff\\xd0\\xff\\xff\\xd9", b"\\xff\\xd8")]
+edges.welded_edges(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2], [1, 3, 2], [0, 1, 4]]))
+edges.angle_between(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)), edges.turned(mi.Vector3f(2, 0, 0), mi.Vector3f(1, 1, 0), mi.Vector3f(0, 0, 3)), edges.across(mi.Vector3f(2, 0, 0), mi.Vector3f(1, 1, 0))
+edges.outline_direction(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1), mi.Point2f([0.1, 0.5, 0.9, 0.3], [0.2, 0.4, 0.6, 0.9]), 0.25)
+ball().cosine(mi.Point3f([0, 5, 9], 0, 0)), ball().center, ball().radius
+graph.face_normals(np.array([[[0.0, 0, 0], [2, 0, 0], [0, 1, 0]]])), rays.grid(2), rays.ray_offset(mi.Point3f(1, -3, 2)), rays.visible(100)
+deformation._corners(mi.Point2f([0, 0.3, 1], [0.5, 0.9, 1]), 4, 3)
+deformation.Motion((1, 2, 3), {"x": "a", "rotation": "r", "scale": "s"}).matrix({"a": mi.Float(2), "r": mi.Vector3f(10, 20, 30), "s": mi.Float(2)}).matrix
+deformation.Motion((1, 2, 3), {"rotation_y": "r"}).matrix({"r": mi.Float(10)}, scaled=False).matrix
+HORIZON.holds(mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])), HORIZON.holds(mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1.1]))
+[catalog._current_value(params_of(value), "k") for value in (mi.Float(1, 2, 3, 4), mi.Float(1, 2, 3, 4, 5), mi.Float(2), dr.zeros(mi.Float, 0))]
+[sweeps.SweepRunRecord("a", {}, 0, status).is_done for status in ("finished", "interrupted", "running", "failed", "waiting")]
+[terminal_line(is_terminal) for is_terminal in (True, False)]
+tree.to_array(mi.Float(3)), tree.like(2.0, np.array(3)), tree.like(mi.Color3f(0), np.float32([[1], [2], [3]])), tree.expected((2, 3))
+jobs._PROGRESS.match("3/40: loss") is not None, jobs._PROGRESS.match("loss 3/4: x") is None
+""".strip().split("\n")  # noqa: E501
+CHECKS = np.indices((8, 8)).sum(0) % 3 + 0.5
+SPOT = np.exp(-((np.indices((16, 16)) - 7.0) ** 2).sum(0) / 4)
+POINTS = np.stack([*np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4)), np.zeros((4, 4))], -1).reshape(-1, 3)
+HORIZON = deformation.Horizon((0.0, 0.0, 0.0), 3**0.5)
+
+
+def towards(distance: float) -> np.ndarray:
+    """Return the unit directions (n, 3) from a lamp at `distance` above the origin to `POINTS`."""
+    directions = POINTS - [0.1, 0.2, distance]
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def missing(share: float | None, error: float | None, seeds: int = 8) -> measurements.MissingRecord:
+    return measurements.MissingRecord("c", "k", share, error, 2, seeds)
+
+
+def judged(share: float | None, error: float | None) -> list[bool]:
+    record = missing(share, None if share is None else error)
+    return [record.is_unknown, record.is_incomplete, record.is_for_the_most_part, record.is_decided]
+
+
+def costs(held: dict[str, int]) -> metrics.Regularized:
+    return metrics.Regularized({"a": {"total_variation": 0.25, "thickness": 0.0}}, held)
+
+
+def tally(found: Any, *records: dict[str, Any]) -> Any:
+    for record in records:
+        found.add(make_record(**record))
+    return [found.to_json(), str(found)]
+
+
+def plans() -> list[sweeps.SweepPlan]:
+    two = [sweeps.Combination(name, {"run.spp": place}) for place, name in enumerate("ab")]
+    return [sweeps.SweepPlan("c", [], two, [3, 4], search=found)
+            for found in (None, sweeps.SweepSearch(5, {"x": [1]}))]  # fmt: skip
+
+
+def errors_of(first: float, other: float) -> dict[str, dict[str, float]]:
+    kinds = ("distance +2 %", "light turned by 1 degree about x", "lens turned by 1 degree about y", "index +0.005")
+    return {"as planned": {"ssim": first}, **{kind: {"ssim": other} for kind in kinds}}
+
+
+def V(numbers: list[float] | None, mean: float, low: float, high: float) -> catalog.Value:
+    return catalog.Value(numbers, mean, low, high)
+
+
+def info(value: catalog.Value | None, shape: tuple[int, ...], **more: Any) -> catalog.ParameterInfo:
+    plain = {"key": "a.data", "kind": "bsdf", "type": "Float", "differentiable": True, "discontinuous": False}
+    return catalog.ParameterInfo(**{**plain, "obstacle": None, "shape": shape, "value": value, **more})
+
+
+def suggested(
+    share: float = 0.5, value: Any = None, shape: Any = (), bounds: Any = None, resolution: Any = None
+) -> Any:
+    return proposal.Proposal(info(value, shape), share, bounds, resolution, True)
+
+
+def ball() -> edges.Ball:
+    return edges.Ball.around(mi.Point3f([0, 4], [1, -1], 0), mi.Float(1, 2))
+
+
+def params_of(value: Any) -> Any:
+    return SimpleNamespace(properties={"k": (value, None, None, 0)})
+
+
+def terminal_line(is_terminal: bool) -> list[bytes]:
+    """Return what the last line of a program writes."""
+    written: list[bytes] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(terminal.os, "isatty", lambda _: is_terminal)
+        patch.setattr(terminal.os, "write", lambda _, text: written.append(text))
+        patch.setattr(terminal.select, "select", lambda *_: ([], [2], []))
+        terminal._say("interrupted")
+    return written
+
+
+def shown(value: Any) -> Any:
+    """Return a result for JSON, arrays with all their numbers."""
+    if isinstance(value, (list, tuple)):
+        return [shown(each) for each in value]
+    if dr.is_array_v(value) or isinstance(value, (np.ndarray, np.generic)):
+        return np.array(value).astype(float).round(6).tolist()
+    if isinstance(value, dict):
+        return {str(key): shown(each) for key, each in value.items()}
+    return said.plain(value)
+
+
+@pytest.mark.usefixtures("llvm")
+@pytest.mark.parametrize("number", range(len(CALLS)))
+def test_calls(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    work_in(tmp_path, monkeypatch)
+    try:
+        found = shown(eval(CALLS[number], globals()))
+    except (errors.ConfigError, ValueError) as error:
+        found = f"{type(error).__name__}: {error}"
+    said.check(CALLS[number], [found])
