@@ -17,13 +17,13 @@ import numpy as np
 
 from reslrb_cli.backend.variant import set_variant
 from reslrb_cli.config.integrators import ReslrbConfig
-from reslrb_cli.config.loader import dump, with_integrator
+from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
 from reslrb_cli.measure.engine import STEPS, start_process
 from reslrb_cli.measure.judgement import jackknife
-from reslrb_cli.measure.methods import NEVER
+from reslrb_cli.measure.methods import NEVER, first_message
 from reslrb_cli.measure.participants import ALIKE
 from reslrb_cli.measure.processes import Ended
 from reslrb_cli.measure.steps import adjoint
@@ -118,10 +118,8 @@ class Sampling:
         if the process ends, unless it `may_end`.
         """
         self._say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
-        config = self.config
-        first = {"config": dump(comparable(config, kind.by)), "source": str(config.source), "variant": VARIANT,
-                 "memory_limit": self._limit, "allow_code": False, "quantity": "fixed", "purpose": series,
-                 "arrays": self.arrays}  # fmt: skip
+        config, sampled = comparable(self.config, kind.by), {"quantity": "fixed", "arrays": self.arrays}
+        first = first_message(config, VARIANT, self._limit, purpose=series, **sampled)
         process, taken = start_process(first, f"{STEPS}:begin"), []
         try:
             process.answer(lambda: False)

@@ -19,7 +19,7 @@ from reslrb_cli.backend.installation import python_command
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ExitCode
 from reslrb_cli.measure.draws import Draws, DrawsFile, StoredResults
-from reslrb_cli.measure.methods import MeasurementPlan, NamedIntegrator
+from reslrb_cli.measure.methods import MeasurementPlan, NamedIntegrator, first_message
 from reslrb_cli.measure.processes import CannotStart, Ended, Process, Stopped
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.measurements import BenchStatus, Method
@@ -185,7 +185,8 @@ class Engine:
         """Return a new process for `config` that runs the function `does` of `steps`. `more` are further entries of its
         first message.
         """
-        return self._start(self.plan.first(config) | more, f"{STEPS}:{does}")
+        first = first_message(config, self.plan.variant, self.plan.memory_limit, **more)
+        return self._start(first, f"{STEPS}:{does}")
 
     def begin(self, members: Sequence[Member], arrays: Mapping[str, np.ndarray]) -> Iterator[Member]:
         """Start the processes of these members, load their scenes, and warm up until nothing is compiled. Yields each

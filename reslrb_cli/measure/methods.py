@@ -339,10 +339,11 @@ class MeasurementPlan:
         roulette = name == "ptracer" and plays_roulette(own.max_depth, own.rr_depth)
         return NamedIntegrator(name, name, {"rr_depth": NEVER} if roulette else {}, "the independent reference")
 
-    def first(self, config: Config) -> dict[str, Any]:
-        """Return the first message to a process that measures `config`."""
-        return {"config": dump(config), "source": str(config.source), "variant": self.variant,
-                "memory_limit": self.memory_limit, "allow_code": config.allows_code}  # fmt: skip
+
+def first_message(config: Config, variant: str, memory_limit: int | None, **more: Any) -> dict[str, Any]:
+    """Return the first message to a process that measures `config`. `more` are further entries."""
+    return {"config": dump(config), "source": str(config.source), "variant": variant, "memory_limit": memory_limit,
+            "allow_code": config.allows_code, **more}  # fmt: skip
 
 
 def bench_plan(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +18,7 @@ from turns import a_few
 import reslrb_cli as rl
 from reslrb_cli.config.loader import load, told, with_integrator
 from reslrb_cli.errors import ConfigError, NonFinite
-from reslrb_cli.measure.methods import MeasurementPlan
+from reslrb_cli.measure.methods import first_message
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.views import View
 
@@ -336,9 +335,7 @@ def test_measuring_processes_know_the_permission(experiment: Path) -> None:
     assert (result.exit_code, "--allow-code" in result.output) == (2, True)
     config = load("tiny.yaml", [f"loss={own('own')}"])
     for allowed in (False, True):
-        first = MeasurementPlan.first(
-            SimpleNamespace(variant="llvm_ad_rgb", memory_limit=None), config.with_code(allowed)
-        )
+        first = first_message(config.with_code(allowed), "llvm_ad_rgb", None)
         assert told(json.loads(json.dumps(first))).allows_code is allowed
 
 
