@@ -251,7 +251,7 @@ def test_light_without_edges_has_a_complete_derivative(llvm: str, tmp_path: Path
 
 def test_a_short_measurement_finds_the_derivative_of_a_lens_complete(llvm: str):
     """The light of the lens has no edges, and its caustic bends within the longest step."""
-    path, sets = Path(__file__).parents[2] / "configs/lens_pose.yaml", ["target.render.spp=64"]
+    path, sets = Path(__file__).parents[2] / "configs/lens_pose.yaml", ["target.render.spp=64", "scene.size=[32, 32]"]
     problem = assemble(load(path, sets))
     values = {key: value.copy() for key, value in problem.values().items()}
     found = measure_missing(problem)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,7 +35,8 @@ def _few_samples() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def lens(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
     """Folder with a lens at its start (`lens`), a run of one iteration (`runs/lens`), and an export of this run with
-    tolerances (`out`). The output of the export is in `said.txt`. The lens is 75 mm wide and 100 mm high.
+    tolerances (`out`, and `moved` for tests that write files beside it). The output of the export is in `said.txt`. The
+    lens is 75 mm wide and 100 mm high.
     """
     from lens.test_experiment import picture
 
@@ -48,4 +50,5 @@ def lens(tmp_path_factory: pytest.TempPathFactory, llvm: str) -> Path:
         assert "runs/lens -o FOLDER` writes the solid" in said  # the next command
         said = done("export", folder / "runs/lens", "-o", folder / "out", "--tolerances").output
     (folder / "said.txt").write_text(said)
+    shutil.copytree(folder / "out", folder / "moved")
     return folder

@@ -69,8 +69,8 @@ def in_file(lens: Path, id: str, before: str) -> mi.Scene:
     place = re.search(rf'id="{id}">.*?</transform>', text, re.DOTALL)
     assert place is not None
     end = place.end() - len("</transform>")
-    (lens / "out/moved.xml").write_text(text[:end] + before + text[end:])
-    return mi.load_file(str(lens / "out/moved.xml"), optimize=False)
+    (lens / "moved/moved.xml").write_text(text[:end] + before + text[end:])
+    return mi.load_file(str(lens / "moved/moved.xml"), optimize=False)
 
 
 def with_face(lens: Path, heights: Callable[[np.ndarray], np.ndarray]) -> OpticalBench:
@@ -141,20 +141,19 @@ def test_a_displaced_part_matches_a_scene_of_its_own(name: str, lens: Path) -> N
     elif name == "screen":
         values = made.farther(0.02)
         in_file(lens, "screen", '<translate z="4"/>')
-        text = (lens / "out/moved.xml").read_text()
-        (lens / "out/scene2.xml").write_text(text)
+        text = (lens / "moved/moved.xml").read_text()
         place = re.search(r'id="camera">.*?</transform>', text, re.DOTALL)
         assert place is not None
         end = place.end() - len("</transform>")
-        (lens / "out/moved.xml").write_text(text[:end] + '<translate z="4"/>' + text[end:])
-        other = mi.load_file(str(lens / "out/moved.xml"), optimize=False)
+        (lens / "moved/moved.xml").write_text(text[:end] + '<translate z="4"/>' + text[end:])
+        other = mi.load_file(str(lens / "moved/moved.xml"), optimize=False)
     else:
         values = made.denser(0.005)
         text = (lens / "out/scene.xml").read_text()
         index = find_glass("PMMA").nd
         assert f'value="{index:.9g}"' in text
-        (lens / "out/moved.xml").write_text(text.replace(f"{index:.9g}", f"{index + 0.005:.9g}"))
-        other = mi.load_file(str(lens / "out/moved.xml"), optimize=False)
+        (lens / "moved/moved.xml").write_text(text.replace(f"{index:.9g}", f"{index + 0.005:.9g}"))
+        other = mi.load_file(str(lens / "moved/moved.xml"), optimize=False)
     seen = made.image(values, 16)
     wanted = OpticalBench(other, mi.traverse(other), FLAT, mi.load_dict(PTRACER), 0).render(16)
     assert np.abs(seen - wanted).mean() < 3e-4 * wanted.mean()  # the same light paths
