@@ -184,7 +184,7 @@ def compared(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest
 
     def remember(*given: Any, **options: Any) -> Any:
         result = invoke(*given, **options)
-        lines = [line for line in (result.stdout + result.stderr).splitlines() if not line.startswith("variant ")]
+        lines = said.lines_of(result.stdout, result.stderr)
         calls.append(said.masked([*map(str, given[2]), result.exit_code, *lines], tmp_path))
         return result
 

@@ -14,8 +14,6 @@ from kit import TEXTURE, area, ref, scene, sensor, shape
 
 from reslrb_cli.optimization import losses
 
-pytestmark = pytest.mark.usefixtures("compared")
-
 SCENE = scene(
     '<default name="format" value="rgb"/> <default name="power" value="8"/> <default name="wall" value="wall.exr"/>',
     sensor(id="camera", pixels="$format"), '<bsdf type="diffuse" id="poster">REFLECTANCE</bsdf>',

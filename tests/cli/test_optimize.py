@@ -16,8 +16,6 @@ from kit import POSTER_BSDF, area, diffuse, ref, scene, sensor, shape
 from optimization import glass
 from turns import a_few
 
-pytestmark = pytest.mark.usefixtures("compared")
-
 # `reslrb optimize`, `render` and `inspect` on a scene of three surfaces, from the command line to the run folder.
 
 SCENE = scene(

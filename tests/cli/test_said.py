@@ -249,7 +249,7 @@ def check(*words: str) -> None:
     """
     result = reslrb(*words, "--json", "a.jsonl")
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    warned = [line for line in result.stderr.splitlines() if not line.startswith("variant ")]
+    warned = said.lines_of(result.stderr)
     lines = Path("a.jsonl").read_text().splitlines()[1:] if Path("a.jsonl").exists() else []
     records = [
         {key: value for key, value in json.loads(line).items() if key != "options" and value is not None}

@@ -77,6 +77,8 @@ OTHERS = {
 }
 #: Folders of other fixtures.
 _TEMPORARY = re.compile(r"/\S*/pytest-of-\w+/pytest-\d+/(popen-gw\d+/)?")
+#: Lines about the variant, and about progress.
+_PASSING = re.compile(r"variant |\d+/\d+: ")
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT[\d:+]+|\b\d+\.\d+ s\b|\b\d+ MiB\b")
 
 
@@ -89,6 +91,11 @@ def masked(value: Any, folder: Path) -> Any:
     if not isinstance(value, str):
         return value
     return _TIME.sub("...", _TEMPORARY.sub("", value.replace(str(folder), "HERE").replace(str(ROOT), "ROOT")))
+
+
+def lines_of(*texts: str) -> list[str]:
+    """Return the lines of a command's output, without those that depend on time or on earlier commands."""
+    return [line for text in texts for line in text.splitlines() if not _PASSING.match(line)]
 
 
 def content(file: Path, folder: Path) -> Any:

@@ -31,7 +31,7 @@ def check(name: str, folder: Path, *words: str, root: str = "runs") -> None:
     before = {file: file.stat().st_mtime_ns for file in Path(root).rglob("*") if file.is_file()}
     result = reslrb(*words)
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    lines = [line for line in result.stderr.splitlines() if not line.startswith("variant ")]
+    lines = said.lines_of(result.stderr)
     found = {
         "code": result.exit_code,
         "out": said.masked(result.stdout.splitlines(), folder),
