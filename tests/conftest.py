@@ -48,27 +48,27 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in left_out]
 
 
-#: Diagrams that earlier tests drew, by the labels of their axes.
-DRAWN: dict[tuple[str, str], str] = {}
+#: Diagrams that earlier tests drew, by the labels of their axes and the kinds of their curves.
+DRAWN: dict[tuple[Any, ...], str] = {}
 
 
 def drawn_once(panel: Any) -> str:
-    """Return the first diagram that was drawn with these labels, for all sets of curves with data. Drawing takes longer
-    than these runs.
+    """Return the first diagram that was drawn with these labels and curves of these kinds. Drawing takes longer than
+    most runs of tests.
     """
     from reslrb_cli.report.page.layout import diagram
 
-    if not panel.shown():
-        return diagram(panel)
-    if (panel.x, panel.y) not in DRAWN:
-        DRAWN[panel.x, panel.y] = diagram(panel)
-    return DRAWN[panel.x, panel.y]
+    curves = [(curve.place, len(curve.xs), curve.known()) for curve in panel.shown()]
+    kinds = [(place, len(known) > 1, len(known) < count, known.min() > 0) for place, count, known in curves]
+    if (kind := (panel.x, panel.y, *kinds)) not in DRAWN:
+        DRAWN[kind] = diagram(panel)
+    return DRAWN[kind]
 
 
 @pytest.fixture(autouse=True)
-def _draw_once(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw each diagram of runs once, except in the tests of pages, which check the diagrams."""
-    if "report" not in request.path.parts and "reslrb_cli.report" in sys.modules:
+def _draw_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw each kind of a run's diagrams once."""
+    if "reslrb_cli.report" in sys.modules:
         monkeypatch.setattr("reslrb_cli.report.page.values.diagram", drawn_once)
 
 
