@@ -17,7 +17,7 @@ from kit import work_in
 from records.test_metrics import make_record
 
 from reslrb_cli import errors
-from reslrb_cli.cli import init, inspect, jobs, options, render, serve, terminal
+from reslrb_cli.cli import init, inspect, jobs, optimize, options, render, serve, terminal
 from reslrb_cli.cluster import connection
 from reslrb_cli.config.loader import parse_override
 from reslrb_cli.records import (
@@ -127,6 +127,9 @@ exporting._free(Path("/other/B.png"), Path("/h"), {"assets/b.png"}), exporting._
 [pictures.turn(np.arange(6).reshape(2, 3), n) for n in range(1, 9)]
 pictures.decode_srgb(np.array([-0.1, 0.0, 0.04, 0.04045, 0.0405, 0.5, 1, 2]))
 [pictures.find_colours(names) for names in (["B", "G", "R"], ["Y"], ["x"], ["a.r", "a.g", "a.b", "Z"], ["a.R", "a.G", "a.B", "b.RGBA.R", "b.RGBA.G", "b.RGBA.B"], ["Y", "A"])]
+pictures.find_colours([f"{layer}.{letter}" for layer in ("a.Combined", "b.Combined") for letter in "RGB"])
+pictures.find_colours([f"{layer}.{letter}" for layer in ("a", "b") for letter in "RGB"])
+[notices(quiet) for quiet in (True, False)]
 pictures._to_xyz([0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329])
 [pictures._ends(data) for data in (b"\\xff\\xd8\\xff\\xd9", b"\\xff\\xd8\\xff\\xe0\\x00\\x04\\xff\\xd9", b"\\xff\\xd8\\xff\\xd0\\xff\\xff\\xd9", b"\\xff\\xd8")]
 edges.welded_edges(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2], [1, 3, 2], [0, 1, 4]]))
@@ -207,6 +210,21 @@ def ball() -> edges.Ball:
 
 def params_of(value: Any) -> Any:
     return SimpleNamespace(properties={"k": (value, None, None, 0)})
+
+
+def notices(quiet: bool) -> list[Any]:
+    """Return the notice that a run would print at the first signal."""
+    found: list[Any] = []
+
+    def begin(**options: Any) -> None:
+        found.append(options)
+        raise KeyboardInterrupt
+
+    course = SimpleNamespace(problem=SimpleNamespace(config=SimpleNamespace(run=SimpleNamespace(iterations=3))))
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(terminal, "Interrupts", begin)
+        optimize._run(SimpleNamespace(course=course, manifest=None), None, [], quiet)
+    return found
 
 
 def terminal_line(is_terminal: bool) -> list[bytes]:

@@ -43,9 +43,6 @@ _SUMMARIES = {
     "doctor": "Say which backend is in use, and what is missing.",
 }
 
-#: Environment variable with which a shell requests completions; click derives it from the program's name.
-COMPLETE_VARIABLE = "_RESLRB_COMPLETE"
-
 
 class _Main(click.Group):
     """Group that loads commands by name and turns every user error into one line and an exit code."""
@@ -84,7 +81,7 @@ class _Main(click.Group):
         """Run the command line `args` and exit with its code. With `standalone_mode=False`, errors pass to the
         caller.
         """
-        if not standalone_mode or os.environ.get(COMPLETE_VARIABLE):  # completions are bytes, not lines
+        if not standalone_mode:
             return super().main(args, prog_name, complete_var, standalone_mode=False, **extra)
         self.debug = os.environ.get("RESLRB_DEBUG", "0") not in ("", "0")
         try:

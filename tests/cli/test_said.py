@@ -327,7 +327,7 @@ UNMEASURED = compared("a", "reslrb:event", Verdict.NOT_MEASURED, "the budget was
         ("--budget 7 --spp 3 --integrators reslrb:stack", [HOLDS, OPEN]),
         ("--seeds 5", [UNMEASURED, UNMEASURED]),
         ("--seeds 4", []),
-        ("--suite extreme --seeds 6 --integrators reslrb:stack", [HOLDS, FAILS, OPEN]),
+        ("--suite extreme --seeds 6 --integrators reslrb:stack,reslrb:gather(paths=both)", [HOLDS, FAILS, OPEN]),
         ("--suite extreme:second", [HOLDS, OPEN]),
         ("--suite extreme:second,third --set variant=llvm_ad_spectral", [HOLDS]),
     ],

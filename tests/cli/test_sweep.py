@@ -592,7 +592,7 @@ def test_errors_without_a_common_unit_are_relative():
 def test_the_page_has_a_table_curves_and_pictures(folder):
     words = ["sweep", "tiny.yaml", *tiny.settings(*QUICK), "--vary", "target.render.spp=[8, 16]", "--seeds", "2"]
     tiny.done(*words, "-o", "s")
-    tiny.done("report", "s")
+    assert "look at s/sweep.html" in tiny.done("report", "s").output
     content = json.loads(Path("s/sweep.json").read_text())
     tiny.done("report", "s", "-o", "page.html")
     for page in ("s/sweep.html", "page.html"):
