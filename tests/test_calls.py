@@ -216,14 +216,15 @@ def notices(quiet: bool) -> list[Any]:
     """Return the notice that a run would print at the first signal."""
     found: list[Any] = []
 
-    def begin(**options: Any) -> None:
-        found.append(options)
+    def begin(**given: Any) -> None:
+        found.append(given)
         raise KeyboardInterrupt
 
     course = SimpleNamespace(problem=SimpleNamespace(config=SimpleNamespace(run=SimpleNamespace(iterations=3))))
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(terminal, "Interrupts", begin)
-        optimize._run(SimpleNamespace(course=course, manifest=None), None, [], quiet)
+        with pytest.raises(KeyboardInterrupt):
+            optimize._run(SimpleNamespace(course=course, manifest=None), None, [], quiet)
     return found
 
 
