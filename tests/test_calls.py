@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import drjit as dr
 import mitsuba as mi
@@ -31,6 +32,7 @@ from reslrb_cli.records import (
     sweeps,
     tree,
 )
+from reslrb_cli.report import run_summary
 from reslrb_cli.runs import log, loggers, prepare, search, workshop
 from reslrb_cli.runs import sweep as planned
 from reslrb_cli.scene import cameras, catalog, deformation, edges, graph, proposal, rays, upsampling, values, visibility
@@ -130,6 +132,7 @@ pictures.decode_srgb(np.array([-0.1, 0.0, 0.04, 0.04045, 0.0405, 0.5, 1, 2]))
 pictures.find_colours([f"{layer}.{letter}" for layer in ("a.Combined", "b.Combined") for letter in "RGB"])
 pictures.find_colours([f"{layer}.{letter}" for layer in ("a", "b") for letter in "RGB"])
 [notices(quiet) for quiet in (True, False)]
+[bar_text(columns) for columns in (None, 59, 60, 61, 79, 80, 81)]
 pictures._to_xyz([0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329])
 [pictures._ends(data) for data in (b"\\xff\\xd8\\xff\\xd9", b"\\xff\\xd8\\xff\\xe0\\x00\\x04\\xff\\xd9", b"\\xff\\xd8\\xff\\xd0\\xff\\xff\\xd9", b"\\xff\\xd8")]
 edges.welded_edges(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2], [1, 3, 2], [0, 1, 4]]))
@@ -210,6 +213,18 @@ def ball() -> edges.Ball:
 
 def params_of(value: Any) -> Any:
     return SimpleNamespace(properties={"k": (value, None, None, 0)})
+
+
+def bar_text(columns: int | None) -> list[Any]:
+    """Return the calls of a bar in a terminal with this width. The time left takes 12 characters."""
+    bar = MagicMock(format_dict={"ncols": columns})
+    bar.format_interval.return_value = "01:23:4"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run_summary, "descriptions", lambda *_: ["x" * 40, "y" * 20, "z" * 30])
+        progress = optimize.Progress(4, False, None)  # type: ignore[arg-type]
+        progress._bar = bar
+        progress.show(make_record(iteration=2))
+    return [str(call) for call in bar.mock_calls]
 
 
 def notices(quiet: bool) -> list[Any]:
