@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from kit import diffuse, scene, sensor, shape
+from optimization import glass
 from optimization.judged import (
     ALPHA,
     CONFIG,
@@ -35,8 +37,9 @@ from reslrb_cli.optimization import targets
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty import measuring
-from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
 from reslrb_cli.optimization.uncertainty.measuring import LEAST_ITERATIONS, Certainty
+from reslrb_cli.optimization.uncertainty.verdicts import weigh
 from reslrb_cli.statistics import rms
 
 # Verdicts about runs with known truth, of which half are made to fail. Verdicts are right, and none is too favourable.
@@ -186,6 +189,48 @@ def test_regularizers_are_part_of_gradients_and_curvature(folder, monkeypatch):
     added = gradients[0].mean(axis=0) - seen
     assert rms(added) > 0
     assert added @ seen < -0.7 * np.linalg.norm(added) * np.linalg.norm(seen)  # both gradients oppose each other
+
+
+@pytest.mark.parametrize(("side", "spp"), [(2, 128), (3, 512)])
+def test_each_entry_of_a_tiny_texture_has_its_own_direction(folder, side, spp, monkeypatch):
+    """A texture of few texels has no groups of entries. It is settled if each of its texels is."""
+    texture = np.random.default_rng(side).uniform(0.3, 0.8, (side, side, 3)).astype(np.float32)
+    mi.Bitmap(texture).write(str(folder / f"tiny{side}.exr"))
+    (folder / f"tiny{side}.xml").write_text(LIGHTS.replace("poster.exr", f"tiny{side}.exr"))
+    toy = Toy("tiny", {POSTER: COLOR}, {POSTER: SETTLED},
+              (f"scene.file=tiny{side}.xml", "run.iterations=40", f"run.spp={spp}",
+               "optimizer={type: auto}"))  # fmt: skip
+    given = []
+    monkeypatch.setattr(measuring, "weigh", lambda *parts: (given.append(parts), weigh(*parts))[1])
+    found = run(folder, toy)
+    assert verdicts(toy, found) == toy.right, told(toy, found)
+    ((measured, directions, *_),) = given
+    assert [each.entry for each in directions] == list(range(3 * side**2))
+    about = found.certainty.parameters[POSTER]
+    error = rms(found.errors[POSTER])
+    assert 0.3 * about.spread[0] < error < 1.3 * about.spread[0]
+    assert measured[POSTER].is_small
+
+
+def test_the_scale_of_a_heightmap_is_the_size_of_its_values(llvm, tmp_path):
+    """Its bounds are far larger, and a step of a share of them would fold the caustic."""
+    motions = "{motion: {of: slab, free: [x]}}, {motion: {of: lamp, free: [x]}}"
+    heightmap = "parameters=[{heightmap: {mesh: slab, resolution: [3, 3]}, initial: %s}]"
+    for initial, scale in ((0.01, 0.01), (0.0, 1.0)):
+        certainty = Certainty(glass.assemble(tmp_path, heightmap % initial))
+        assert certainty.scale("slab.heightmap") == pytest.approx(scale)
+    problem = glass.assemble(tmp_path, f"parameters=[{motions}]")
+    assert Certainty(problem).scale("slab.x") == pytest.approx(0.5 * problem.optimizer.extent("slab.x"))
+
+
+def test_a_parameter_that_was_measured_in_part_has_no_directions(llvm):
+    """Time may end between two entries. The other parameters stay."""
+    places = [ParameterDirection("a", np.eye(3)[k], None, k) for k in range(3)]
+    places += [ParameterDirection("t", np.ones(9), 0), ParameterDirection("b", np.eye(2)[0], None, 0)]
+    sizes = {"a": 3, "t": 9, "b": 2}
+    measured = {key: SimpleNamespace(value=np.zeros(size)) for key, size in sizes.items()}
+    assert measuring._complete(places, range(5), measured) == [0, 1, 2, 3]
+    assert measuring._complete(places, [1, 3], measured) == [3]
 
 
 @pytest.mark.long

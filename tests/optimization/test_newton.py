@@ -23,7 +23,7 @@ from reslrb_cli.optimization.block import SHIFT, Block, JointState
 from reslrb_cli.optimization.newton import LONGEST, _steepness, fine_part
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.state import guiding_of, standing
-from reslrb_cli.optimization.uncertainty.curvature import raise_eigenvalues
+from reslrb_cli.optimization.uncertainty.curvature import lower_eigenvalues, raise_eigenvalues
 from reslrb_cli.optimization.variables import make_transform
 
 AUTO = "optimizer={type: auto}"
@@ -516,6 +516,23 @@ def test_a_noisy_curvature_does_not_lead_to_long_steps():
     assert max(least) < 50
     certain = np.diag([0.0, 0.0, 1e5])
     np.testing.assert_allclose(raise_eigenvalues(slopes, slopes, certain)[0], true + certain, rtol=0.02)
+
+
+def test_noise_gives_a_combination_without_effect_no_curvature():
+    """The sum of four entries has no effect on the image. The curvature of the other combinations stays."""
+    random, slopes = np.random.default_rng(3), np.random.default_rng(2).normal(size=(4, 2000))
+    slopes -= slopes.mean(axis=0)
+    left, others = [], []
+    for _ in range(200):
+        a, b = (slopes + 0.3 * random.normal(size=slopes.shape) for _ in range(2))
+        found = lower_eigenvalues(a, b)
+        np.testing.assert_allclose(found, found.T, atol=1e-9)
+        left.append(np.full(4, 0.5) @ found @ np.full(4, 0.5))
+        others.append(np.linalg.eigvalsh(found)[1:])
+    # One standard error is about 0.09 sqrt(2000). A normal deviate exceeds it with a probability of 16 %.
+    assert np.mean(np.greater(left, 1)) < 0.25
+    assert max(left) < 15
+    np.testing.assert_allclose(np.mean(others, axis=0), np.linalg.eigvalsh(slopes @ slopes.T)[1:], rtol=0.1)
 
 
 def test_a_run_ends_close_to_the_optimum_before_its_limit(tmp_path, steps):

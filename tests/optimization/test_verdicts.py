@@ -410,6 +410,28 @@ def test_curvature_is_averaged_over_entries_with_similar_steps():
     assert few.mean_of_target(np.arange(3)) == pytest.approx(1 + np.std([-2, 1, 4]) / np.sqrt(3))
 
 
+@pytest.mark.parametrize("correlated", [False, True])
+def test_a_tiny_texture_is_settled_if_its_texels_are_within_the_tolerance_on_average(correlated):
+    """The error of each texel is 0.03 on average, so single texels may exceed the tolerance of 0.05. Errors in the
+    brightness of the whole texture do not average out.
+    """
+    random, size, count, verdicts, spreads = np.random.default_rng(4), 16, 44, [], []
+    covariance = 0.03**2 * (0.99 * np.ones((size, size)) + 0.01 * np.eye(size) if correlated else np.eye(size))
+    H, value = 1e-3 * np.linalg.inv(covariance), np.full(size, 0.5)
+    noise = 1e-3 * count**0.5 * np.linalg.cholesky(np.linalg.inv(covariance))  # the mean is off by `covariance`
+    places = [ParameterDirection("t", unit, None, k) for k, unit in enumerate(np.eye(size))]
+    for _ in range(20):
+        gradients = random.normal(size=(count, size)) @ noise.T
+        last = np.stack([gradients[4:], np.tile(value, (count - 4, 1))], axis=1)
+        own = Measured(value, (0.0, 1.0), 0.5, gradients[:4], np.full(size, 1e-3), True, value - 0.1, last)
+        found = weigh({"t": own}, places, H, np.zeros_like(H), {})["t"]
+        verdicts.append(found.verdict)
+        spreads.append(found.spread[0])
+    assert 0.02 < np.mean(spreads) < 0.08
+    assert verdicts.count("settled") >= 16 or correlated, verdicts
+    assert verdicts.count("settled") <= 1 or not correlated, verdicts
+
+
 @pytest.mark.parametrize("size", [16, 48, 400])
 def test_dim_texels_are_as_uncertain_as_they_are(size):
     """The curvature falls by a factor of 10,000 from the middle of a highlight to its border. The mean over all texels

@@ -36,7 +36,7 @@ map compensates for it (`Maps.undetermined`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,23 +90,19 @@ def followed(
     return found
 
 
-def with_followed(
-    found: tuple[list[ParameterDirection], Array, Array], count: int
-) -> tuple[list[ParameterDirection], Array, Array, Array]:
-    """Return the directions, the diagonal of H without textures that follow, and H and B.
+def with_followed(directions: Sequence[ParameterDirection], H: Array, count: int) -> list[int]:
+    """Return the places of `count` directions among those of `directions` and H.
 
-    `found` has `count` directions without textures that follow, and then those of `followed`. A direction is replaced
-    by the one that textures follow if its curvature is smaller.
+    There are `count` directions without textures that follow, and then those of `followed`. A direction is replaced by
+    the one that textures follow if its curvature is smaller.
     """
-    directions, H, B = found
     chosen = list(range(count))
     places = {(each.key, each.entry): place for place, each in enumerate(directions[:count])}
     for place, direction in enumerate(directions[count:], count):
         first = places[direction.key, direction.entry]
         if H[place, place] < H[first, first]:
             chosen[first] = place
-    at = np.ix_(chosen, chosen)
-    return [directions[place] for place in chosen], np.diag(H)[:count], H[at], B[at]
+    return chosen
 
 
 def texel_offsets(directions: Sequence[ParameterDirection], spreads: Sequence[float]) -> dict[str, tuple[Array, str]]:
@@ -253,17 +249,17 @@ def _mean_squares(precision: Array, pull: Array, prior: Array) -> Array:
 
 
 def measure_maps(
-    curvature: LossCurvature, share: float, most: int, go_on: Callable[[], bool]
+    curvature: LossCurvature, large: Collection[str], share: float, most: int, go_on: Callable[[], bool]
 ) -> tuple[list[Maps], set[str]]:
-    """Measure the maps of each shape that has several large parameters with common cells. Steps are `share` of the
-    values. Also return the parameters of the shapes that `go_on` left out.
+    """Measure the maps of each shape that has several of the `large` parameters with common cells. Steps are `share`
+    of the values. Also return the parameters of the shapes that `go_on` left out.
 
     The measurement is repeated with four times the samples, up to `most` samples per pixel, until the noise is small.
     More noise may hide small eigenvalues of M, and the spreads are then too large.
     """
     problem, found, left, by_shape = curvature.problem, list[Maps](), set[str](), dict[str, list[str]]()
     for key in problem.selection.keys:
-        if key in problem.selection.params and not problem.optimizer.is_small(key):
+        if key in problem.selection.params and key in large:
             by_shape.setdefault(key.split(".")[0], []).append(key)
     for keys in by_shape.values():
         if len(places := _cells(problem, keys)) < 2:

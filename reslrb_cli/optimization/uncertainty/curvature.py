@@ -22,17 +22,8 @@ directions of the smallest eigenvalues, images do not determine a texture.
 Regularizers have their own curvature, without noise. Differences of the regularizers' gradient are added to both kinds
 of curvature.
 
-Noise of a rendered target adds the same b = J^T d to all gradients. Here d is the noise's effect on dL/dI. Images of
-the target's own integrator are samples of the effect d of the target's noise (`_noises`). `d_even` is the mean of d. A
-relative loss gives darkened pixels more weight, so `d_even` pulls all pixels in the same direction. `d_odd` is the
-remainder of d. `d_odd` is split into blocks of pixels that the film's filter may have mixed. B is the second moment of
-b.
-
-    B = sum over blocks (J_a^T d_odd) (J_b^T d_odd)^T + (J^T d_even) (J^T d_even)^T
-
-Noise of a step's images adds the same b to all gradients too, if dL/dI is not a linear function of the image. `l1` and
-`ssim` are examples. `_image_biases` estimates the mean effect on dL/dI with two sets of images. B contains the square
-of the mean pull along each direction, and for single entries the product of both pulls, whose noise has no bias.
+Noise of rendered targets and of a step's images adds the same b to all gradients (`noise.py`). B is the second moment
+of b along the directions.
 
 In the estimate by entry, the diagonal of B is probed and averaged like the diagonal of H. A standard error is then
 added. For few entries, the average may be almost zero by chance. Underestimated target noise would also make results
@@ -41,24 +32,27 @@ look too certain.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.integrators.step import known_step
-from reslrb_cli.optimization.loading import make_configured, paths_of, render_in_passes
-from reslrb_cli.optimization.nonfinite import fill_gaps, finite
+from reslrb_cli.optimization.nonfinite import finite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import see_images, take_gradient
-from reslrb_cli.optimization.views import View, slope, to_tensor
+from reslrb_cli.optimization.uncertainty.noise import (
+    PURPOSE,
+    image_biases,
+    is_linear,
+    second_derivative,
+    target_noises,
+)
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array, rms, scale_frequencies
+from reslrb_cli.statistics import Array, scale_frequencies
 
-_PURPOSE = "curvature"
 #: Parts of keys of textures that mix channels into one number.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
 #: Maximum distance of two texels that are coupled, along each axis, and the smallest eigenvalue of their coupling that
@@ -66,15 +60,8 @@ MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metal
 NEIGHBOURS, LEAST_EIGENVALUE = 2, 0.05
 #: Standard errors that are subtracted from curvature and added to the noise of the target.
 MARGIN = 1.0
-#: Maximum number of image values in H along directions; of more, a random subset, the same for all. Also the number of
-#: blocks of B.
+#: Maximum number of image values in H along directions; of more, a random subset, the same for all.
 MOST_VALUES = 2**18
-#: Images for the target's noise, with the target's samples if these are at most a multiple of a step's.
-REPLICAS, AGAIN = 4, 4
-#: Deviation of dL/dI from a linear function of the image, as a share of dL/dI, that counts as rounding.
-LINEAR = 1e-3
-#: Maximum factor by which they are made brighter or darker.
-MOST_ASTRAY = 10.0
 #: Samples for probes of large parameters, and the number of the sample of products.
 PROBED, FIRST_PRODUCT = 2, 1000
 
@@ -128,15 +115,15 @@ def separates(problem: Problem, key: str) -> bool:
 
 
 def plan_changes(
-    problem: Problem, scales: Mapping[str, float], share: float, most: int = MOST_VALUES
+    problem: Problem, scales: Mapping[str, float], share: float, most: int = MOST_VALUES, small: Collection[str] = ()
 ) -> list[ParameterChange]:
     """Return the renderings for the directions of all parameters in `scales`. Small parameters come first.
 
     Steps are `share` of the scale. There are at most `most` renderings. Parameters without a rendering have no
-    directions.
+    directions. `small` has the large parameters whose entries have a direction each.
     """
     keys = [key for key in problem.selection.keys if key in scales]
-    small = [key for key in keys if problem.optimizer.is_small(key)]
+    small = [key for key in keys if problem.optimizer.is_small(key) or key in small]
     textures = [key for key in keys if problem.selection.array(key).ndim == 3]
     changes: list[ParameterChange] = []
     for key in (*small, *(key for key in textures if key not in small)):
@@ -147,11 +134,12 @@ def plan_changes(
 
 
 def _entries(problem: Problem, key: str, scale: float, share: float) -> list[ParameterChange]:
-    row, together = row_of(problem, key), separates(problem, key)
-    directions = [ParameterDirection(key, unit, k if together else None, k) for k, unit in enumerate(np.eye(row.size))]
+    row, size = row_of(problem, key), 3 if separates(problem, key) else 1
+    directions = [ParameterDirection(key, unit, k % 3 if size == 3 else None, k)
+                  for k, unit in enumerate(np.eye(row.size))]  # fmt: skip
     low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
     changes = []
-    for group in [directions] if together else [[direction] for direction in directions]:
+    for group in (directions[first : first + size] for first in range(0, row.size, size)):
         step = sum(direction.vector for direction in group) * scale * share
         inside = [np.sum((moved >= low) & (moved <= high)) for moved in (row + step, row - step)]
         side = 1.0 if inside[0] >= inside[1] else -1.0
@@ -169,32 +157,6 @@ def _wholes(problem: Problem, key: str, share: float) -> list[ParameterChange]:
     directions = [ParameterDirection(key, v, None if channels == 1 else c) for c, v in enumerate(of) if v.any()]
     # Darker, so that values exceed no bound except 0.
     return [ParameterChange({key: array * (1 - share)}, -share, directions)]
-
-
-@dataclass
-class TargetNoise:
-    """Effect of the noise of one view's target on dL/dI, (H, W, C).
-
-    `even` is the mean effect, and `odd` the remaining effect of one sample. Pixels within a block of side length `side`
-    have common noise.
-    """
-
-    odd: Array
-    even: Array
-    side: int
-
-    def in_blocks(self, slope: Array) -> Array:
-        """Multiply an image's derivative (H, W, C) by the odd part. Return the sum over each block, as a flat array."""
-        product = np.sum(slope * self.odd, axis=2)
-        rows, columns = (np.arange(0, size, self.side) for size in product.shape)
-        return np.asarray(np.add.reduceat(np.add.reduceat(product, rows, axis=0), columns, axis=1).ravel())
-
-    def signed(self, random: np.random.Generator) -> Array:
-        """Return the odd part with a random sign for each block."""
-        height, width = self.odd.shape[:2]
-        signs = random.choice([-1.0, 1.0], size=(-(-height // self.side), -(-width // self.side)))
-        spread = np.repeat(np.repeat(signs, self.side, axis=0), self.side, axis=1)[:height, :width, None]
-        return self.odd * spread
 
 
 @dataclass(frozen=True)
@@ -268,7 +230,7 @@ class LossCurvature:
         self.problem, self.spp, self.round = problem, spp, round
         self._base = self._images()
         pairs = zip(problem.trained, *self._base, strict=True)
-        self._weights = [self._weight(view, 0.5 * (a + b)) for view, a, b in pairs]
+        self._weights = [second_derivative(view, 0.5 * (a + b)) for view, a, b in pairs]
         values = sum(weight.size for weight in self._weights)
         random = np.random.default_rng(self._seed(0, 0))
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
@@ -278,10 +240,10 @@ class LossCurvature:
         #: Derivatives (M, N) of all pixels along each direction, by each set of samples. The first set has the weights.
         self.slopes: tuple[Array, Array] = np.zeros((0, 0)), np.zeros((0, 0))
         #: Samples of the targets' noise by view; empty if no target was rendered.
-        self.noises = self._target_noises() if of_target else []
+        self.noises = target_noises(problem, spp) if of_target else []
         #: Two samples of the mean effect that the noise of a step's images has on dL/dI (H, W, C), by view; empty if
         #: there is none.
-        self.biases = self._image_biases() if of_target and not self._is_linear() else []
+        self.biases = image_biases(problem, self._weights) if of_target and not is_linear(problem, self._base) else []
 
     def repeated(self, round: int) -> LossCurvature:
         """Return a measurement with other samples. The noise of targets and the biases are not measured again."""
@@ -349,7 +311,7 @@ class LossCurvature:
 
     def _images(self) -> list[list[Array]]:
         """Render all views at the current values of the scene, with each set of samples."""
-        return [see_images(self.problem, self.spp, -1 - 2 * self.round - half, _PURPOSE) for half in (0, 1)]
+        return [see_images(self.problem, self.spp, -1 - 2 * self.round - half, PURPOSE) for half in (0, 1)]
 
     def _derivatives(self, change: ParameterChange) -> list[list[Array]]:
         """Return the derivative of each view's exposed image (H, W, C) along a change, for each set of samples."""
@@ -363,6 +325,13 @@ class LossCurvature:
             ]
             for pair in pairs
         ]
+
+    def for_verdicts(self, directions: Sequence[ParameterDirection], places: Sequence[int]) -> Array:
+        """Return H (M, M) along `directions`, which were at `places` in the latest call of `along`. Its eigenvalues
+        are lowered by their standard errors (`lower_eigenvalues`).
+        """
+        a, b = (slopes[list(places)] for slopes in self.slopes)
+        return lower_eigenvalues(a, b) + self._of_regularizers(directions)
 
     def for_steps(self, directions: Sequence[ParameterDirection]) -> tuple[Array, float]:
         """Return H (M, M) along the directions of `along`, with eigenvalues of at least their standard errors, and the
@@ -434,94 +403,6 @@ class LossCurvature:
         a, b = (self._probe(gradients, number + half) for half, gradients in enumerate((one, other)))
         return {key: (a[key].astype(np.float64), b[key].astype(np.float64)) for key in a}
 
-    def _target_noises(self) -> list[list[TargetNoise]]:
-        config, trained = self.problem.config, self.problem.trained
-        render = config.target.render
-        if render is None or all(view.file is not None for view in trained):
-            return []
-        chosen = render.integrator or config.integrator
-        paths = paths_of(chosen, self.problem.scene, self.problem.sensors, self.problem.moves)
-        integrator = make_configured(config, chosen, paths, self.problem.scene)
-        multiple = chosen.options().get("samples_per_pass")
-        by_view = [self._noises(view, integrator, render.spp, multiple) for view in trained]
-        return [list(sample) for sample in zip(*by_view, strict=True)]
-
-    def _noises(self, view: View, integrator: Any, spp: int, multiple: int | None) -> list[TargetNoise]:
-        """Return samples of the effect that the noise of a view's target has on dL/dI. For a file, the samples are
-        zero.
-
-        The target has `spp` samples. The function renders several images with the target's sample count. Each image
-        takes the role of the target in turn. The mean of the other images serves as the target's expected value. If
-        `spp` exceeds `AGAIN` times the samples of a step, the images have few samples instead. Their differences,
-        scaled to the target's noise, are then added to the target. All sample counts are multiples of `multiple`.
-        """
-        true = np.array(view.target, dtype=np.float64)
-        if view.file is not None:
-            return [TargetNoise(np.zeros_like(true), np.zeros_like(true), 1)] * REPLICAS
-        run, unit = self.problem.config.run, multiple or 1
-        again, few = spp <= AGAIN * run.spp, max(self.spp // unit, 1) * unit
-        images = []
-        for number in range(REPLICAS):
-            image = render_in_passes(
-                integrator, self.problem.scene, view.sensor, spp if again else few, run.seed, number,
-                f"{_PURPOSE}, target", multiple,
-            )  # fmt: skip
-            shown = view.kept(image[:, :, : true.shape[2]].astype(np.float64))
-            images.append(self.problem.leave_out(f"an image of the target of sensor {view.sensor}", shown))
-        images = list(fill_gaps(np.array(images)))
-        # If noise has led the values astray, the images are not as bright as the target.
-        bright = np.sum(view.kept(true)) * REPLICAS / max(float(np.sum(images)), 1e-300)
-        images = [image * np.clip(bright, 1 / MOST_ASTRAY, MOST_ASTRAY) for image in images]
-        if again:
-            total = np.sum(images, axis=0)
-            found = [self._slope(view, image, (total - image) / (REPLICAS - 1)) for image in images]
-            even = np.mean(found, axis=0)
-            odd = [(each - even) * np.sqrt(REPLICAS / (REPLICAS - 1)) for each in found]
-        else:
-            noises = [(a - b) * np.sqrt(few / spp / 2) for a, b in zip(images[::2], images[1::2], strict=True)]
-            sides = [[self._slope(view, true + side * noise, true) for side in (1, -1)] for noise in noises]
-            odd = [0.5 * (up - down) for up, down in sides] * 2
-            even = np.mean(sides, axis=(0, 1))
-        mixed = max(round(2 * self.problem.scene.sensors()[view.sensor].film().rfilter().radius()), 1)
-        side = max(mixed, round(np.ceil(np.sqrt(true.shape[0] * true.shape[1] / MOST_VALUES))))
-        return [TargetNoise(each, even, side) for each in odd]
-
-    def _is_linear(self) -> bool:
-        """True if dL/dI is a linear function of the image, as that of `l2` is. Noise of the image then has no bias."""
-        for view, *halves in zip(self.problem.trained, *self._base, strict=True):
-            a, b = (fill_gaps(np.array([half]))[0] for half in halves)
-            true = np.array(view.target, dtype=np.float64)
-            apart = 0.5 * (self._slope(view, true, a) + self._slope(view, true, b))
-            if rms(apart - self._slope(view, true, 0.5 * (a + b))) > LINEAR * rms(apart):
-                return False
-        return True
-
-    def _image_biases(self) -> list[list[Array]]:
-        """Return two samples of the mean effect of the images' noise on dL/dI, by view.
-
-        The mean of several images takes the role of the image without noise. Its own noise leaves at most half of the
-        effect, which is the share for a kink, as that of `l1`. The difference is therefore doubled. A kink is sharper
-        without noise, so its curvature is larger than W. The effect is multiplied by the ratio of both, because offsets
-        are divided by W.
-        """
-        problem, found = self.problem, []
-        for half in (0, 1):
-            numbers = range(FIRST_PRODUCT + REPLICAS * half, FIRST_PRODUCT + REPLICAS * (half + 1))
-            images = [see_images(problem, problem.config.run.spp, -number, _PURPOSE) for number in numbers]
-            biases: list[Array] = []
-            for view, samples in zip(problem.trained, zip(*images, strict=True), strict=True):
-                true, known = np.array(view.target, dtype=np.float64), fill_gaps(np.array(samples))
-                mean = known.mean(axis=0)
-                bias = np.mean([self._slope(view, true, image) for image in known], axis=0)
-                softer = self._weights[len(biases)].sum() / max(float(self._weight(view, mean).sum()), 1e-300)
-                biases.append(2 * min(softer, 1.0) * (bias - self._slope(view, true, mean)))
-            found.append(biases)
-        return found
-
-    def _slope(self, view: View, target: Array, image: Array) -> Array:
-        """Return dL/dI of an exposed `image` for another `target`, both (H, W, C)."""
-        return finite(slope(replace(view, made=to_tensor(target)).judge, image)) * view.share
-
     def _in_a_row(self, images: Sequence[Array]) -> Array:
         row = np.concatenate([image.ravel() for image in images])
         return row if self._picked is None else row[self._picked]
@@ -543,22 +424,8 @@ class LossCurvature:
             )  # fmt: skip
         return take_gradient(problem)
 
-    def _weight(self, view: View, image: Array) -> Array:
-        """Return d2L/dI2 for the pixels (H, W, C) of a view's exposed `image`. The second derivative is computed from
-        differences of dL/dI.
-
-        The differences of dL/dI use steps as large as the residual between image and target. If L has a kink (`l1`),
-        the result is L's curvature at the scale of the noise.
-        """
-        true = view.kept(np.array(view.target, dtype=np.float64))
-        known = np.isfinite(image)
-        image = np.where(known, image, true)
-        step = max(rms(image - true), 1e-3 * rms(true), 1e-6)
-        up, down = (slope(view.judge, image + side * step).astype(np.float64) for side in (1, -1))
-        return np.where(known, np.maximum(finite(up - down), 0.0), 0.0) / (2 * step) * view.share
-
     def _seed(self, sensor: int, number: int) -> int:
-        return seed(self.problem.config.run.seed, number, sensor, _PURPOSE)
+        return seed(self.problem.config.run.seed, number, sensor, PURPOSE)
 
 
 def _symmetric(product: Array) -> Array:
@@ -579,12 +446,30 @@ def raise_eigenvalues(a: Array, b: Array, certain: Array) -> tuple[Array, float]
     Noise may exceed a small eigenvalue. Steps in its direction would be too long if the result is small, and would stop
     if it is negative.
     """
+    values, vectors, errors, units = _eigenvalues(a, b, certain)
+    return np.asarray((vectors * np.maximum(values, errors)) @ vectors.T * units), float(errors[0])
+
+
+def lower_eigenvalues(a: Array, b: Array) -> Array:
+    """Return the sum of a bᵀ (M, M) with eigenvalues that are lowered by MARGIN standard errors, to at least 0.
+
+    In a direction without an effect on the image, noise makes the eigenvalue positive by chance. The gradients are
+    almost 0 along this direction, so its offset would seem to be known.
+    """
+    values, vectors, errors, units = _eigenvalues(a, b, np.zeros((len(a), len(a))))
+    return np.asarray((vectors * np.maximum(values - MARGIN * errors, 0.0)) @ vectors.T * units)
+
+
+def _eigenvalues(a: Array, b: Array, certain: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the eigenvalues (M,) of the sum of a bᵀ and `certain` in units in which the diagonal is 1, the
+    eigenvectors (M, M), the standard errors (M,) of the eigenvalues, and the squares (M, M) of the units.
+    """
     H = _symmetric(a @ b.T) + certain
     size = np.maximum(np.diag(H), np.sqrt(np.square(a * b).sum(axis=1)))
     root = np.sqrt(np.where(size > 0, size, 1.0))[:, None]
     values, vectors = np.linalg.eigh(H / (root @ root.T))
     errors = np.sqrt(np.square((vectors.T @ (a / root)) * (vectors.T @ (b / root))).sum(axis=1))
-    return np.asarray((vectors * np.maximum(values, errors)) @ vectors.T * (root @ root.T)), float(errors[0])
+    return values, vectors, errors, root @ root.T
 
 
 def _sure_share(terms: Array) -> Array:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -35,8 +36,8 @@ LEAST_ITERATIONS = 20
 #: Gradients at the final values: iterations per gradient, and the limits of their number. They have the samples of a
 #: step, so they compile no kernel.
 ITERATIONS_A_SAMPLE, LEAST_SAMPLES, MOST_SAMPLES = 40, 4, 16
-#: Random probes for large parameters; minimum number of renderings along directions, and iterations per rendering.
-PROBES, LEAST_CHANGES, ITERATIONS_A_CHANGE = 4, 20, 10
+#: Random probes for large parameters, and iterations per rendering along directions.
+PROBES, ITERATIONS_A_CHANGE = 4, 10
 #: Divisor of a step's samples for each of the two sets that measure curvature, and samples per pixel below which all
 #: are used. If noise hides the curvature of entries, more samples are used, up to a multiple of a step's.
 PART, FEW, MOST_MULTIPLE = 4, 4, 16
@@ -50,6 +51,9 @@ MOST_LAST, MOST_RECORDED = 200, 2**22
 #: Maximum number of entries of a texture whose gradients and values are recorded. In larger textures, the gradients at
 #: the final values determine the mean square of the offsets as well, because there are so many entries.
 MOST_ROWS = 2**10
+#: If all large parameters together have at most this many entries, and are textures or heightmaps, each entry has its
+#: own direction. There may always be this many renderings along directions.
+MOST_ENTRIES = 64
 #: Curvature that takes longer than this share of the run's iterations, this many of them, and this many seconds is left
 #: out.
 SHARE, MOST_STEPS, LEAST_SECONDS = 0.25, 50, 20.0
@@ -116,21 +120,22 @@ class Certainty:
                 unit = problem.samples_per_pass or 1
                 spp = max(max(config.run.spp // PART, min(config.run.spp, FEW)) // unit, 1) * unit
                 scales = {key: self.scale(key) for key in gradients}
-                most = max(LEAST_CHANGES, iterations // ITERATIONS_A_CHANGE)
-                plan = plan_changes(problem, scales, STEP, most)
-                curvature = latest = LossCurvature(problem, spp)
-                measured = self._measured(gradients, iterations)
+                tiny = self._tiny()
+                most = max(MOST_ENTRIES, iterations // ITERATIONS_A_CHANGE)
+                plan = plan_changes(problem, scales, STEP, most, tiny)
+                curvature = source = LossCurvature(problem, spp)
+                measured = self._measured(gradients, iterations, tiny)
                 found = curvature.along(plan, go_on)
                 free = {key: own.is_free for key, own in measured.items() if not own.is_small}
-                maps, unknown = measure_maps(curvature, STEP, MOST_MULTIPLE * config.run.spp, go_on)
+                maps, unknown = measure_maps(curvature, free, STEP, MOST_MULTIPLE * config.run.spp, go_on)
                 count, extra = len(found[0]), followed(curvature, plan, free, go_on)
                 if extra:
                     again = curvature.repeated(1)
                     together = again.along([*plan, *extra], go_on)
                     if len(together[0]) >= count:
-                        latest, found = again, together
+                        source, found = again, together
                 while (
-                    hides(found[0][:count], found[1], latest.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp
+                    hides(found[0][:count], found[1], source.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp
                 ):
                     if not go_on.affords(PART * go_on.spent):
                         break
@@ -139,7 +144,7 @@ class Certainty:
                     together = latest.along([*plan, *extra], go_on)
                     if len(together[0]) < len(found[0]):
                         break
-                    found = together
+                    source, found = latest, together
                 # By entry, if a parameter has no directions for its entries.
                 seen = {direction.key for direction in found[0] if direction.entry is not None}
                 left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
@@ -147,7 +152,10 @@ class Certainty:
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            directions, alone, H, B = with_followed(found, count)
+            places = _complete(found[0], with_followed(found[0], found[1], count), measured)
+            directions = [found[0][place] for place in places]
+            H, B = source.for_verdicts(directions, places), found[2][np.ix_(places, places)]
+            alone = np.array([found[1][place, place] for place in _complete(found[0], range(count), measured)])
             by_entry = {key: entries for key, entries in by_entry.items() if key not in unknown}
             weighed = weigh(measured, directions, H, B, by_entry, alone, maps)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
@@ -188,12 +196,14 @@ class Certainty:
         The scale is the largest root mean square among three arrays. The arrays are the initial values, the final
         values, and the difference of both. For parameters without a unit of light, the scale is at least half of the
         range between the bounds, and for motions half of their extent. For the index of a glass, only the difference
-        counts. If all are 0, it is 1.
+        counts. The bounds of a heightmap are far larger than its values, so they do not count. If all are 0, it is 1.
         """
         first, last = self._initial[key], row_of(self.problem, key)
         sizes = [rms(first), rms(last), rms(last - first)]
         if bends_light(self.problem.selection.params, key):
             return sizes[-1] or 1.0  # a share of an index would move the light out of the picture
+        if key in self.problem.selection.deformation.quantities and self.problem.selection.array(key).ndim == 3:
+            return max(sizes) or 1.0
         if key in self.problem.optimizer.extents:
             sizes.append(0.5 * self.problem.optimizer.extent(key))
         low, high = self.problem.selection.specs[key].bounds or (-np.inf, np.inf)
@@ -216,12 +226,23 @@ class Certainty:
         wide = np.pad(shown, ((0, 0), (halo // 2, halo - halo // 2)), mode="wrap")
         return np.repeat(wide.ravel(), channels)
 
-    def _measured(self, gradients: Gradients, iterations: int) -> dict[str, Measured]:
+    def _tiny(self) -> set[str]:
+        """Return the large parameters whose entries have a direction each (`MOST_ENTRIES`)."""
+        large = [key for key in self.problem.selection.keys if not self.problem.optimizer.is_small(key)]
+        arrays = [self.problem.selection.array(key) for key in large]
+        entries = sum(row_of(self.problem, key).size for key in large)
+        has_halo = entries > sum(array.size for array in arrays)
+        if entries > MOST_ENTRIES or has_halo or any(array.ndim != 3 for array in arrays):
+            return set()
+        return set(large)
+
+    def _measured(self, gradients: Gradients, iterations: int, tiny: Collection[str]) -> dict[str, Measured]:
         optimizer, found = self.problem.optimizer, {}
         for key, rows in gradients.items():
             value, last, own = row_of(self.problem, key), self.last.get(key), None
             last = None if last is None else last[-(iterations // 2) :]
-            if last is not None and not optimizer.is_small(key) and value.size <= MOST_ROWS:
+            is_small = optimizer.is_small(key) or key in tiny
+            if last is not None and not is_small and value.size <= MOST_ROWS:
                 channels = self.problem.selection.array(key).shape[2]
                 own, last = last, np.array([brightness(g, x, channels) for g, x in last])
             found[key] = Measured(
@@ -230,13 +251,23 @@ class Certainty:
                 scale=self.scale(key),
                 gradients=rows,
                 step=np.nan_to_num(optimizer.response(key) * optimizer.rate(key) * self.rates[-1]),
-                is_small=optimizer.is_small(key),
+                is_small=is_small,
                 start=self._initial[key],
                 last=last,
                 rows=own,
                 seen=self._seen_entries(key, rows),
             )
         return found
+
+
+def _complete(
+    directions: Sequence[ParameterDirection], places: Sequence[int], measured: Mapping[str, Measured]
+) -> list[int]:
+    """Return the `places` of directions without those of small parameters of which only a part was measured in time."""
+    counts = Counter(directions[place].key for place in places)
+    return [place for place in places
+            if directions[place].entry is None
+            or counts[directions[place].key] == measured[directions[place].key].value.size]  # fmt: skip
 
 
 def gradient_count(iterations: int) -> int:

@@ -58,9 +58,10 @@ class Measured:
     """Parameter of N entries at the end of a run: its values (N,), bounds, scale, and K gradients (K, N).
 
     - `step` (N,) is an entry's movement by the last step, per unit of gradient.
+    - `is_small` is true if each entry has its own direction.
     - `start` (N,) are the values before the first iteration.
     - `last` (n, 2, m) has the last n iterations, if known: the gradients, and the values at which they were computed.
-        m is N for a small parameter. For a texture, they are the derivative by the logarithm of each channel's
+        m is N for a small parameter. For a larger texture, they are the derivative by the logarithm of each channel's
         brightness, and that logarithm (`brightness`).
     - `rows` (n, 2, N) has the gradients and the values of the last n iterations of a small texture, if known.
     - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.

@@ -41,6 +41,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.uncertainty.coupling import Maps, texel_offsets
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.posterior import (
@@ -342,13 +343,34 @@ def _small(own: Measured, at: Sequence[int], found: Judged) -> ParameterCertaint
     alone = np.where([partner is None for partner in partners], np.inf, of("alone", np.inf))
     estimate = Estimate(of("limit", np.inf), of("limit_of_run", np.inf), spread, alone, of("is_pulled", 0.0) > 0)
     verdicts = judge(own, estimate, own.tolerance(own.value))
+    if own.seen is not None:
+        verdicts = [v if seen else ParameterVerdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
+    known = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
+    is_tiny = own.value.size > SMALL and any(known)
+    if is_tiny and _limit_of_all(own, at, found, np.array(known)) <= own.tolerance(rms(own.value[known])):
+        verdicts = [ParameterVerdict.SETTLED if each else v for each, v in zip(known, verdicts, strict=True)]
     verdict = summarise(shares(verdicts))
     named = [name for name, each in zip(partners, verdicts, strict=True) if name and each is verdict]
     partner = named[0] if named and verdict is ParameterVerdict.NOT_DETERMINED else None
     # A value at a bound may be as far from the optimum as the optimum is beyond the bound.
-    known = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
-    parts = (np.where(known, part, np.nan) for part in (spread, to_go, of_target))
+    parts = [np.where(known, part, np.nan) for part in (spread, to_go, of_target)]
+    if is_tiny:
+        parts = [np.array([rms(part[known])]) for part in parts]
     return _certainty(verdict, verdicts, partner, *parts)
+
+
+def _limit_of_all(own: Measured, at: Sequence[int], found: Judged, known: Array) -> float:
+    """Return the limit of the root mean square offset of the `known` entries of a small texture. Offsets that are
+    correlated do not average out.
+    """
+    assert found.posterior is not None
+    rows = [found.places[place] for place, each in zip(at, known, strict=True) if each and place in found.places]
+    if len(rows) < known.sum():
+        return np.inf
+    posterior = found.posterior
+    squares = posterior.spread[rows] ** 2 + (CURVATURE_ERROR * posterior.pulled[rows]) ** 2
+    both = posterior.covariance[np.ix_(rows, rows)] + np.diag(posterior.of_target[rows] ** 2)
+    return float(np.sqrt(squares.mean() + SURE * np.sqrt(2 * np.sum(both**2)) / len(rows)))
 
 
 def _large(
