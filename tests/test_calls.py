@@ -18,7 +18,7 @@ from kit import work_in
 from records.test_metrics import make_record
 
 from reslrb_cli import errors
-from reslrb_cli.cli import init, inspect, jobs, optimize, options, render, serve, terminal
+from reslrb_cli.cli import example, init, inspect, jobs, optimize, options, render, serve, terminal
 from reslrb_cli.cluster import connection
 from reslrb_cli.config.loader import parse_override
 from reslrb_cli.records import (
@@ -132,6 +132,7 @@ pictures.decode_srgb(np.array([-0.1, 0.0, 0.04, 0.04045, 0.0405, 0.5, 1, 2]))
 pictures.find_colours([f"{layer}.{letter}" for layer in ("a.Combined", "b.Combined") for letter in "RGB"])
 pictures.find_colours([f"{layer}.{letter}" for layer in ("a", "b") for letter in "RGB"])
 [notices(quiet) for quiet in (True, False)]
+[[name, example._about(path)] for name, path in example.examples().items()]
 [bar_text(columns) for columns in (None, 59, 60, 61, 79, 80, 81)]
 pictures._to_xyz([0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329])
 [pictures._ends(data) for data in (b"\\xff\\xd8\\xff\\xd9", b"\\xff\\xd8\\xff\\xe0\\x00\\x04\\xff\\xd9", b"\\xff\\xd8\\xff\\xd0\\xff\\xff\\xd9", b"\\xff\\xd8")]

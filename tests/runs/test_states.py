@@ -26,7 +26,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
-from reslrb_cli.records.run_folder import RunFolder, read_config, read_value
+from reslrb_cli.records.run_folder import RunFolder, read_config, read_value, recovered
 from reslrb_cli.runs import prepare, recorder, resume
 from reslrb_cli.runs.log import append_log
 from reslrb_cli.runs.prepare import moves
@@ -382,6 +382,11 @@ def test_unfinished_files_of_a_run_are_removed_at_its_end(run: Path, monkeypatch
     monkeypatch.setattr(recorder, "write_parameters", lambda *given: ((run / ".y.1.part").touch(), write(*given)))
     assert optimize("--resume", str(run), "--quiet") == 0
     assert list(run.rglob(".*.part")) == []
+
+
+def test_recovered_values_are_found_from_any_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(run.parent)
+    assert [str(spec.initial.run) for spec in recovered(Path("run"), ()).parameters] == [str(run)]
 
 
 def test_any_text_can_be_logged(run: Path) -> None:

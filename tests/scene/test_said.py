@@ -17,6 +17,7 @@ from cli.every_plugin import ROWS, Row, write_files
 from golden import said
 
 from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.scene import upsampling
 from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.edges import EdgeSet, edge_kinds
 from reslrb_cli.scene.graph import SceneGraph
@@ -198,3 +199,26 @@ def test_glass_with_dispersion(rough: dict[str, Any]) -> None:
         parts = (value, density, weight, bs.wo, bs.pdf, bs.eta, mi.Float(bs.sampled_type))
         found[str(mode)] = [np.array(each, np.float64).round(5).tolist() for each in parts]
     said.check(f"glass with dispersion {rough}", found)
+
+
+@pytest.mark.usefixtures("spectral")
+def test_spectra_of_colours() -> None:
+    """Coefficients from the table and from the equations, for dark, bright and saturated colours, with each channel as
+    the largest one.
+    """
+    rgb = [
+        [0.02, 0.5, 0.9, 0.1, 0.3, 0.7, 0.98],
+        [0.03, 0.4, 0.1, 0.8, 0.3, 0.9, 0.99],
+        [0.01, 0.6, 0.2, 0.1, 0.9, 0.1, 0.97],
+    ]
+    colours = mi.Color3f(*rgb)
+    wavelengths = np.array([450.0, 550, 650])
+    found = {}
+    for name, made in (("table", upsampling._from_table(colours)), ("solved", upsampling.coefficients(colours))):
+        c = np.array(made, np.float64)
+        v = (c[0] * wavelengths[:, None] + c[1]) * wavelengths[:, None] + c[2]
+        found[name] = [
+            (0.5 + 0.5 * v / np.sqrt(1 + v**2)).round(4).tolist(),
+            upsampling.colours_of(c.T).round(4).tolist(),
+        ]
+    said.check("spectra of colours", found)
