@@ -130,6 +130,8 @@ def test_sweeps(
     monkeypatch.setattr(sweep, "call", pretend({}, told))
     check(f"{name}, again", folder, "sweep", "--resume", "s", *again, root="s")
     said.check(f"{name}, calls", said.masked(told, folder))
+    if name == "sweep":
+        check("report of a sweep", folder, "report", "s", root="s")
 
 
 # Loggers, with packages that only remember their calls.
