@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -15,9 +15,11 @@ from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.uncertainty.coupling import followed, measure_maps, with_followed
+from reslrb_cli.optimization.uncertainty.coupling import Maps, followed, measure_maps, with_followed
 from reslrb_cli.optimization.uncertainty.curvature import (
+    EntryCurvature,
     LossCurvature,
+    ParameterChange,
     ParameterDirection,
     plan_changes,
     row_of,
@@ -117,47 +119,16 @@ class Certainty:
             gradients = {key: fill_gaps(np.array(samples)) for key, samples in rows.items()}
             go_on = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations, LEAST_SECONDS), stop)
             with clock.step() as times:
-                unit = problem.samples_per_pass or 1
-                spp = max(max(config.run.spp // PART, min(config.run.spp, FEW)) // unit, 1) * unit
-                scales = {key: self.scale(key) for key in gradients}
                 tiny = self._tiny()
+                measured = self._measured(gradients, iterations, tiny)
+                scales = {key: self.scale(key) for key in gradients}
                 most = max(MOST_ENTRIES, iterations // ITERATIONS_A_CHANGE)
                 plan = plan_changes(problem, scales, STEP, most, tiny)
-                curvature = source = LossCurvature(problem, spp)
-                measured = self._measured(gradients, iterations, tiny)
-                found = curvature.along(plan, go_on)
-                free = {key: own.is_free for key, own in measured.items() if not own.is_small}
-                maps, unknown = measure_maps(curvature, free, STEP, MOST_MULTIPLE * config.run.spp, go_on)
-                count, extra = len(found[0]), followed(curvature, plan, free, go_on)
-                if extra:
-                    again = curvature.repeated(1)
-                    together = again.along([*plan, *extra], go_on)
-                    if len(together[0]) >= count:
-                        source, found = again, together
-                while (
-                    hides(found[0][:count], found[1], source.sure, gradients) and spp < MOST_MULTIPLE * config.run.spp
-                ):
-                    if not go_on.affords(PART * go_on.spent):
-                        break
-                    spp *= PART
-                    latest = LossCurvature(problem, spp, round=2)
-                    together = latest.along([*plan, *extra], go_on)
-                    if len(together[0]) < len(found[0]):
-                        break
-                    source, found = latest, together
-                # By entry, if a parameter has no directions for its entries.
-                seen = {direction.key for direction in found[0] if direction.entry is not None}
-                left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
-                by_entry = curvature.by_entry(PROBES, go_on) if left else {}
+                found = _measure_curvature(problem, plan, measured, go_on)
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            places = _complete(found[0], with_followed(found[0], found[1], count), measured)
-            directions = [found[0][place] for place in places]
-            H, B = source.for_verdicts(directions, places), found[2][np.ix_(places, places)]
-            alone = np.array([found[1][place, place] for place in _complete(found[0], range(count), measured)])
-            by_entry = {key: entries for key, entries in by_entry.items() if key not in unknown}
-            weighed = weigh(measured, directions, H, B, by_entry, alone, maps)
+            weighed = weigh(measured, found.directions, found.H, found.B, found.by_entry, found.alone, found.maps)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
             return CertaintyRecord(
@@ -168,7 +139,7 @@ class Certainty:
                 learning_rate=config.optimizer.learning_rate,
                 target_noise=self._target_noise(),
                 target_spp=None if render is None else render.spp,
-                is_biased=bool(curvature.biases),
+                is_biased=found.is_biased,
             )
         finally:
             take_gradient(problem)
@@ -258,6 +229,65 @@ class Certainty:
                 seen=self._seen_entries(key, rows),
             )
         return found
+
+
+@dataclass(frozen=True)
+class Curvatures:
+    """Measured curvature at the final values: H and B (M, M) along `directions`, and `alone` (M,) along each direction
+    if no texture follows; the curvature of each entry of large parameters; and the maps of one shape. `is_biased` is
+    true if noise of the images biases the gradients of the loss.
+    """
+
+    directions: list[ParameterDirection]
+    H: Array
+    B: Array
+    alone: Array
+    by_entry: dict[str, EntryCurvature]
+    maps: list[Maps]
+    is_biased: bool
+
+
+def _measure_curvature(
+    problem: Problem, plan: Sequence[ParameterChange], measured: Mapping[str, Measured], go_on: _Budget
+) -> Curvatures:
+    """Measure the curvature along the changes of `plan`, and by entry, until `go_on` returns false."""
+    run, unit = problem.config.run, problem.samples_per_pass or 1
+    spp = max(max(run.spp // PART, min(run.spp, FEW)) // unit, 1) * unit
+    curvature = source = LossCurvature(problem, spp)
+    found = curvature.along(plan, go_on)
+    free = {key: own.is_free for key, own in measured.items() if not own.is_small}
+    maps, unknown = measure_maps(curvature, free, STEP, MOST_MULTIPLE * run.spp, go_on)
+    count, extra = len(found[0]), followed(curvature, plan, free, go_on)
+    if extra:
+        again = curvature.repeated(1)
+        together = again.along([*plan, *extra], go_on)
+        if len(together[0]) >= count:
+            source, found = again, together
+    gradients = {key: own.gradients for key, own in measured.items()}
+    while hides(found[0][:count], found[1], source.sure, gradients) and spp < MOST_MULTIPLE * run.spp:
+        if not go_on.affords(PART * go_on.spent):
+            break
+        spp *= PART
+        latest = LossCurvature(problem, spp, round=2)
+        together = latest.along([*plan, *extra], go_on)
+        if len(together[0]) < len(found[0]):
+            break
+        source, found = latest, together
+    # By entry, if a parameter has no directions for its entries.
+    seen = {direction.key for direction in found[0] if direction.entry is not None}
+    left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
+    by_entry = curvature.by_entry(PROBES, go_on) if left else {}
+    places = _complete(found[0], with_followed(found[0], found[1], count), measured)
+    directions = [found[0][place] for place in places]
+    return Curvatures(
+        directions=directions,
+        H=source.for_verdicts(directions, places),
+        B=found[2][np.ix_(places, places)],
+        alone=np.array([found[1][place, place] for place in _complete(found[0], range(count), measured)]),
+        by_entry={key: entries for key, entries in by_entry.items() if key not in unknown},
+        maps=maps,
+        is_biased=bool(curvature.biases),
+    )
 
 
 def _complete(
