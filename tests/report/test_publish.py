@@ -11,6 +11,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from report.measured import (
     FLOOR,
     ORIGIN,
@@ -26,7 +27,7 @@ import reslrb_cli as rl
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.records.measurements import BenchStatus, Method, MethodRecord, PointRecord, Range
 from reslrb_cli.report.panels import TIME
-from reslrb_cli.report.plots import COLORS, FLOOR_STYLE
+from reslrb_cli.report.plots import COLORS, FLOOR_STYLE, Curve, Panel, draw
 from reslrb_cli.report.publish import WIDTH, as_csv, as_latex, escaped, figure, panels_of, rows_of, write
 from reslrb_cli.report.sources import read_sources
 
@@ -256,3 +257,10 @@ def test_csv_quotes_names(tmp_path):
     write_hostile(tmp_path / "c")
     rows = list(csv.DictReader(io.StringIO(as_csv(rows_of(sources(tmp_path / "c"))))))
     assert rows[0]["label"] == HOSTILE
+
+
+@pytest.mark.parametrize(("lowest", "scale"), [(0.0, "linear"), (1e-3, "log")])
+def test_only_positive_values_have_a_logarithmic_axis(lowest, scale):
+    axis = Figure().subplots()
+    draw(axis, Panel("", "x", "y", [Curve("a", [1, 2, 3], [lowest, 1, 1e6])]))
+    assert axis.get_yscale() == scale
