@@ -136,7 +136,8 @@ def test_an_interrupted_suite_leaves_no_process(checkout: Path) -> None:
     text = """#!/bin/sh
     case "$2" in
     mypy) echo $$ >mypy; exec sleep 60 ;;
-    pytest) trap 'exit 2' INT; while [ ! -s mypy ]; do sleep 0.01; done; echo ready; sleep 10 ;;
+    pytest) trap 'exit 2' INT; while [ ! -s mypy ]; do sleep 0.01; done
+        echo ready; for i in 1 2 3 4 5 6 7 8 9; do sleep 0.5; done ;;  # the signal may come between two commands
     esac
     """
     make_program(checkout / ".venv/bin/python", text.replace("\n    ", "\n"))

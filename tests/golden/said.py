@@ -90,7 +90,9 @@ def masked(value: Any, folder: Path) -> Any:
         return [masked(each, folder) for each in value]
     if not isinstance(value, str):
         return value
-    return _TIME.sub("...", _TEMPORARY.sub("", value.replace(str(folder), "HERE").replace(str(ROOT), "ROOT")))
+    # A path may be relative to the working directory.
+    own = re.sub(rf"[\w./-]*{re.escape(str(folder)[max(str(folder).find('pytest-of-'), 0) :])}", "HERE", value)
+    return _TIME.sub("...", _TEMPORARY.sub("", own.replace(str(folder), "HERE").replace(str(ROOT), "ROOT")))
 
 
 def lines_of(*texts: str) -> list[str]:
