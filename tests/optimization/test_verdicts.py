@@ -10,10 +10,12 @@ import pytest
 
 from reslrb_cli.optimization.results import got_worse
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
-from reslrb_cli.optimization.uncertainty.posterior import Measured, joint, noise_covariance, pooled
+from reslrb_cli.optimization.uncertainty.posterior import Measured, Posterior, joint, noise_covariance, pooled
 from reslrb_cli.optimization.uncertainty.verdicts import (
     Estimate,
+    Judged,
     ParameterVerdict,
+    _limit_of_all,
     judge,
     shares,
     summarise,
@@ -430,6 +432,23 @@ def test_a_tiny_texture_is_settled_if_its_texels_are_within_the_tolerance_on_ave
     assert 0.02 < np.mean(spreads) < 0.08
     assert verdicts.count("settled") >= 16 or correlated, verdicts
     assert verdicts.count("settled") <= 1 or not correlated, verdicts
+
+
+def test_correlated_offsets_do_not_average_out():
+    """The limit exceeds the root mean square of 85 % of all draws of the offsets. It needs all entries."""
+    random, size, places = np.random.default_rng(6), 16, dict(zip(range(16), range(16), strict=True))
+    own = Measured(np.ones(size), (0.0, 2.0), 1.0, np.ones((3, size)), np.ones(size), True, np.zeros(size))
+    limits = []
+    for alike in (0.0, 0.5, 0.99):
+        covariance = 0.1**2 * (alike * np.ones((size, size)) + (1 - alike) * np.eye(size))
+        error, zero = np.sqrt(np.diag(covariance)), np.zeros(size)
+        found = Judged(Posterior(zero, error, zero, zero, error, covariance, 1.0), places, [None] * size)
+        limits.append(_limit_of_all(own, range(size), found, np.ones(size, dtype=bool)))
+        draws = [rms(row) for row in random.multivariate_normal(zero, covariance, 2000)]
+        assert 0.85 < np.mean(np.less(draws, limits[-1])) <= 1
+        short = replace(found, places={0: 0})
+        assert _limit_of_all(own, range(size), short, np.ones(size, dtype=bool)) == np.inf
+    assert limits[0] < 1.4 * 0.1 < limits[2]
 
 
 @pytest.mark.parametrize("size", [16, 48, 400])
