@@ -329,10 +329,12 @@ def compare_expectations(
     elif heavy:
         verdict = Verdict.HEAVY_TAILED
         message = "single seeds dominate the variance: use more samples per pixel, or more seeds"
-    elif few or detectable > RESOLUTION:
-        verdict, message = Verdict.UNRESOLVED, f"a deviation of {detectable:.0%} could hide in the noise"
-        message = f"{len(ours)} seeds are too few to know the noise" if few else message
-        message += f": use at least {TAIL_SEEDS}" if few else ": use more seeds"
+    elif few:
+        verdict = Verdict.UNRESOLVED
+        message = f"{len(ours)} seeds are too few to know the noise: use at least {TAIL_SEEDS}"
+    elif detectable > RESOLUTION:
+        verdict = Verdict.UNRESOLVED
+        message = f"a deviation of {detectable:.0%} could hide in the noise: use more seeds"
     return Comparison(
         verdict, relative_l2=far, z_rms=z_rms, z_rms_limit=rms_limit, z_max=z_max, z_max_limit=family.z_max_limit,
         detectable=detectable, message=message, **_alikeness(ours, reference),

@@ -99,9 +99,9 @@ class Gradcheck:
         images = [(label, way, parts.images[way][0]) for label, way in shown]
         found = [Row(None, label, one, Kind.IMAGE, way) for label, way, one in images if one is not None]
         # Guiding, a quasi-random sequence and measured pixels make paths differ from those of naive AD at equal seeds.
-        usual = {name: PLAIN[name] for name in ("guiding", "sequence", "pixels")}
+        names = ("guiding", "sequence", "pixels")
         options = {label: config.integrator.options() for label, config in self.settings.configs.items()}
-        plain = [label for label, own in options.items() if usual == usual | {k: own[k] for k in usual if k in own}]
+        plain = [label for label, own in options.items() if all(own.get(n, PLAIN[n]) == PLAIN[n] for n in names)]
         for key in parts.case.keys:
             for listed in parts.listed:
                 ours = listed.type == "reslrb" and listed.label in plain
@@ -167,10 +167,10 @@ class Gradcheck:
         found, stored = self.file.draws(about), self.file.stored(about)
         if found is None or stored is None or found.seeds.tolist() != list(seeds(len(found))):
             return []
-        self._roundings[name] = roundings = list(stored.facts.get("roundings", ()))
+        roundings = list(stored.facts.get("roundings", ()))
         if len(roundings) != len(found):  # the file is of an earlier version
-            self._roundings[name] = []
             return []
+        self._roundings[name] = roundings
         rows = list(found.values)[: self.seeds]
         self.participants.restore(name[1], stored.facts["steps"], roundings[len(rows) - 1])
         return rows

@@ -6,7 +6,7 @@ Each family has a scene and parameters of one kind. A seed determines the true v
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,16 +15,13 @@ import mitsuba as mi
 import numpy as np
 import yaml
 from kit import TEXTURE, area, diffuse, scene, sensor, shape
-from optimization.judged import LEFT, POSTER, RIGHT, WALL, write_scene
+from optimization.judged import LEFT, POSTER, RIGHT, WALL, iterate_to_the_end, write_scene
 from optimization.judged import SCENE as LIGHTS
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.loop import iterate
 from reslrb_cli.optimization.optimizers import SMALL
-from reslrb_cli.optimization.state import standing
-from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.uncertainty.posterior import LEAST_VALUE, TOLERANCE
 from reslrb_cli.statistics import rms
 
@@ -60,8 +57,32 @@ class Family:
     draw: Callable[[Random, Path], Draw]
 
 
-def color(random: Random) -> list[float]:
-    return [float(each) for each in random.uniform(0.1, 0.85, 3)]
+def color(random: Random, low: float = 0.1, high: float = 0.85) -> list[float]:
+    return [float(each) for each in random.uniform(low, high, 3)]
+
+
+def recolored(random: Random, keys: Sequence[str]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return the parameters of these colours, and their true values."""
+    return [entry(key, 0.5) for key in keys], {key: color(random) for key in keys}
+
+
+def mirrored(random: Random, folder: Path, sizes: Sequence[int], key: str
+             ) -> tuple[list[dict[str, Any]], dict[str, Any]]:  # fmt: skip
+    """Return the parameters of a rug of one of these sizes and of the mirror's colour `key`, and their true values."""
+    size = int(random.choice(sizes))
+    texture(random, folder, "rug0", size)
+    truth = {RUG: texture(random, folder, "rug", size), key: color(random, 0.4, 0.95)}
+    return [entry(RUG, 0.5), entry(key, 0.5)], truth
+
+
+def under_l1(draw: Callable[[Random, Path], Draw]) -> Callable[[Random, Path], Draw]:
+    """Return a function that draws the same runs with the loss `l1`."""
+
+    def drawn(random: Random, folder: Path) -> Draw:
+        parameters, truth, settings = draw(random, folder)
+        return parameters, truth, settings | {"loss.type": "l1"}
+
+    return drawn
 
 
 def texture(random: Random, folder: Path, name: str, size: int, channels: int = 3, low: float = 0.1) -> dict[str, str]:
@@ -110,16 +131,16 @@ def lit_wall(random: Random, folder: Path) -> Draw:
     truth: dict[str, Any] = {WALL: color(random)}
     if LEFT in keys:
         parameters.append(entry(LEFT, 3.0, 0.0, 100.0))
-        truth[LEFT] = [float(each) for each in random.uniform(3, 12, 3)]
+        truth[LEFT] = color(random, 3, 12)
     return parameters, truth, {"integrator.max_depth": 3}
 
 
 def corner(random: Random, folder: Path) -> Draw:
     chosen = random.permutation(SURFACES).tolist()[: int(random.integers(1, 4))]
-    parameters, truth = [entry(key, 0.5) for key in chosen], {key: color(random) for key in chosen}
+    parameters, truth = recolored(random, chosen)
     if random.random() < 0.5:
         parameters.append(entry("panel.emitter.radiance.value", 4.0, 0.0, 100.0))
-        truth["panel.emitter.radiance.value"] = [float(each) for each in random.uniform(4, 14, 3)]
+        truth["panel.emitter.radiance.value"] = color(random, 4, 14)
     return parameters, truth, {"integrator.max_depth": 4}
 
 
@@ -127,7 +148,7 @@ def poster(random: Random, folder: Path) -> Draw:
     parameters, truth = [entry(POSTER, 0.5)], {POSTER: texture(random, folder, "print", 4)}
     if random.random() < 0.5:
         parameters.append(entry(RIGHT, 2.0, 0.0, 100.0))
-        truth[RIGHT] = [float(each) for each in random.uniform(3, 12, 3)]
+        truth[RIGHT] = color(random, 3, 12)
     return parameters, truth, {"integrator.max_depth": 3}
 
 
@@ -211,10 +232,8 @@ TINTED = scene(
 
 
 def tinted(random: Random, folder: Path) -> Draw:
-    size, key = int(random.choice([8, 16, 32])), "mirror.bsdf.base_color.value"
-    texture(random, folder, "rug0", size)
-    truth = {RUG: texture(random, folder, "rug", size), key: [float(each) for each in random.uniform(0.4, 0.95, 3)]}
-    return [entry(RUG, 0.5), entry(key, 0.5)], truth, {"integrator.max_depth": 4}
+    parameters, truth = mirrored(random, folder, (8, 16, 32), "mirror.bsdf.base_color.value")
+    return parameters, truth, {"integrator.max_depth": 4}
 
 
 PLATE = scene(
@@ -230,11 +249,7 @@ PLATE = scene(
 
 
 def plate(random: Random, folder: Path) -> Draw:
-    size = int(random.choice([4, 8, 16]))
-    texture(random, folder, "rug0", size)
-    key = "plate.bsdf.specular_reflectance.value"
-    truth = {RUG: texture(random, folder, "rug", size), key: [float(each) for each in random.uniform(0.4, 0.95, 3)]}
-    parameters = [entry(RUG, 0.5), entry(key, 0.5)]
+    parameters, truth = mirrored(random, folder, (4, 8, 16), "plate.bsdf.specular_reflectance.value")
     if random.random() < 0.4:
         parameters.append(entry("plate.bsdf.alpha.value", 0.25, 0.03, 0.6))
         truth["plate.bsdf.alpha.value"] = float(random.uniform(0.06, 0.3))
@@ -249,8 +264,7 @@ def exposed_wall(random: Random, folder: Path) -> Draw:
 def exposed_corner(random: Random, folder: Path) -> Draw:
     chosen = random.permutation(SURFACES).tolist()[: int(random.integers(1, 3))]
     exposure = str(random.choice(["auto", "per_channel"]))
-    return ([entry(key, 0.5) for key in chosen], {key: color(random) for key in chosen},
-            {"integrator.max_depth": 4, "target.exposure": exposure})  # fmt: skip
+    return *recolored(random, chosen), {"integrator.max_depth": 4, "target.exposure": exposure}
 
 
 BALL = scene(
@@ -303,16 +317,6 @@ def relief(random: Random, folder: Path) -> Draw:
             {"integrator.max_depth": 4, "optimizer": optimizer})  # fmt: skip
 
 
-def l1_wall(random: Random, folder: Path) -> Draw:
-    parameters, truth, settings = lit_wall(random, folder)
-    return parameters, truth, settings | {"loss.type": "l1"}
-
-
-def l1_rug(random: Random, folder: Path) -> Draw:
-    parameters, truth, settings = rug(random, folder)
-    return parameters, truth, settings | {"loss.type": "l1"}
-
-
 def recover(family: Family, seed: int, folder: Path) -> list[Recovered]:
     """Make the run of a family with this seed, from the check of missing derivatives to the verdicts."""
     random = np.random.default_rng([FAMILIES.index(family), seed])
@@ -335,11 +339,7 @@ def recover(family: Family, seed: int, folder: Path) -> list[Recovered]:
     problem = problem.afresh(problem.values()) if missing else problem
     true = {key: np.asarray(value, dtype=np.float64) for key, value in problem.truth.items()}
     problem.truth.clear()
-    certainty, state = Certainty(problem), standing(problem)
-    for after, record in iterate(problem, state):
-        certainty.see(state, after)
-        certainty.rates.append(record.lr / problem.config.optimizer.learning_rate)
-        state, last = after, record
+    certainty, last = iterate_to_the_end(problem)
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
     assert found is not None
     found = found.without_derivatives([record.parameter for record in missing if record.is_incomplete])
@@ -367,5 +367,5 @@ FAMILIES = [
     Family("exposed corner", "exposures", CORNER, exposed_corner),
     Family("moved box", "motions", BALL, moved_box), Family("moved lamp", "motions", BALL, moved_lamp),
     Family("slab", "heightmaps", GLASS, relief), Family("relief", "heightmaps", RELIEF, relief),
-    Family("l1 wall", "l1", LIGHTS, l1_wall), Family("l1 rug", "l1", ROOM, l1_rug),
+    Family("l1 wall", "l1", LIGHTS, under_l1(lit_wall)), Family("l1 rug", "l1", ROOM, under_l1(rug)),
 ]  # fmt: skip

@@ -18,9 +18,11 @@ from kit import POSTER_BSDF, area, diffuse, ref, scene, sensor, shape
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import iterate
+from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.state import standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
+from reslrb_cli.records.metrics import Record
 
 LEFT, RIGHT, HIDDEN = (f"{name}.emitter.radiance.value" for name in ("left", "right", "hidden"))
 TWIN, OTHER_TWIN = (f"{name}.emitter.radiance.value" for name in ("twin", "other_twin"))
@@ -89,6 +91,16 @@ def write_scene(folder: Path) -> None:
     (folder / "toy.yaml").write_text(CONFIG)
 
 
+def iterate_to_the_end(problem: Problem) -> tuple[Certainty, Record]:
+    """Make all iterations. Return the certainty, with their gradients and values, and the last record."""
+    certainty, state = Certainty(problem), standing(problem)
+    for after, record in iterate(problem, state):
+        certainty.see(state, after)
+        certainty.rates.append(record.lr / problem.config.optimizer.learning_rate)
+        state, last = after, record
+    return certainty, last
+
+
 def run(folder: Path, toy: Toy, seed: int = 0, truth: Mapping[str, Any] | None = None) -> Outcome:
     """Run the recovery in `folder`, which holds the scene, and return the measured certainty. `truth` has the true
     values of a run whose target is a file.
@@ -99,12 +111,7 @@ def run(folder: Path, toy: Toy, seed: int = 0, truth: Mapping[str, Any] | None =
     problem = assemble(load(folder / "toy.yaml", settings))
     true = {key: np.asarray(value, dtype=np.float64) for key, value in (truth or problem.truth).items()}
     problem.truth.clear()  # no verdict uses the truth
-    certainty = Certainty(problem)
-    state = standing(problem)
-    for after, record in iterate(problem, state):
-        certainty.see(state, after)
-        certainty.rates.append(record.lr / problem.config.optimizer.learning_rate)
-        state, last = after, record
+    certainty, last = iterate_to_the_end(problem)
     before = {key: value.copy() for key, value in problem.values().items()}
     found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
     assert found is not None

@@ -229,8 +229,8 @@ def test_a_parameter_that_was_measured_in_part_has_no_directions(llvm):
     places += [ParameterDirection("t", np.ones(9), 0), ParameterDirection("b", np.eye(2)[0], None, 0)]
     sizes = {"a": 3, "t": 9, "b": 2}
     measured = {key: SimpleNamespace(value=np.zeros(size)) for key, size in sizes.items()}
-    assert measuring._complete(places, range(5), measured) == [0, 1, 2, 3]
-    assert measuring._complete(places, [1, 3], measured) == [3]
+    assert measuring._complete(places, measured) == [0, 1, 2, 3]
+    assert measuring._complete([places[1], places[3]], measured) == [1]
 
 
 @pytest.mark.long

@@ -133,9 +133,8 @@ def _best(
     """
     problem, key = curvature.problem, change.directions[0].key
     unit = np.sum([direction.vector for direction in change.directions], axis=0)
-    whole = replace(change.directions[0], vector=unit, channel=None)
-    if len(change.directions) == 1:
-        whole = change.directions[0]
+    channels = [direction.channel for direction in change.directions]
+    whole = replace(change.directions[0], vector=unit, channel=channels[0] if len(channels) == 1 else None)
     last = d = after = best = {name: np.zeros(r.size) for name, r in stiff.items()}
     least, first = np.inf, dict[str, Array]()
     for number in range(ROUNDS):
@@ -156,13 +155,12 @@ def _best(
     if not any(row.any() for row in best.values()):
         return []
     moved, best = _together(problem, change, best)
-    directions = []
+    directions, are_separate = [], all(separates(problem, name) for name in best)
     for direction in change.directions:
-        parts = best if direction is whole else {
-            name: np.where(np.arange(row.size) % 3 == direction.channel, row, 0.0) for name, row in best.items()
-        }  # fmt: skip
+        channel, parts = direction.channel if are_separate else None, best
+        if channel is not None:
+            parts = {name: np.where(np.arange(row.size) % 3 == channel, row, 0.0) for name, row in best.items()}
         partner = max(parts, key=lambda name: abs(float(first[name] @ parts[name])))
-        channel = direction.channel if all(separates(problem, name) for name in parts) else None
         directions.append(replace(direction, channel=channel, partner=partner, followers=parts))
     return [replace(moved, directions=directions)]
 

@@ -273,31 +273,30 @@ def _measure_curvature(
         if len(together[0]) < len(found[0]):
             break
         source, found = latest, together
+    directions, H, B = found
     # By entry, if a parameter has no directions for its entries.
-    seen = {direction.key for direction in found[0] if direction.entry is not None}
+    seen = {direction.key for direction in directions if direction.entry is not None}
     left = any(np.any(rows) for key, rows in gradients.items() if key not in seen)
     by_entry = curvature.by_entry(PROBES, go_on) if left else {}
-    places = _complete(found[0], with_followed(found[0], found[1], count), measured)
-    directions = [found[0][place] for place in places]
+    kept, chosen = _complete(directions[:count], measured), with_followed(directions, H, count)
+    places = [chosen[place] for place in kept]
+    judged = [directions[place] for place in places]
     return Curvatures(
-        directions=directions,
-        H=source.for_verdicts(directions, places),
-        B=found[2][np.ix_(places, places)],
-        alone=np.array([found[1][place, place] for place in _complete(found[0], range(count), measured)]),
+        directions=judged,
+        H=source.for_verdicts(judged, places),
+        B=B[np.ix_(places, places)],
+        alone=np.diag(H)[kept],
         by_entry={key: entries for key, entries in by_entry.items() if key not in unknown},
         maps=maps,
         is_biased=bool(curvature.biases),
     )
 
 
-def _complete(
-    directions: Sequence[ParameterDirection], places: Sequence[int], measured: Mapping[str, Measured]
-) -> list[int]:
-    """Return the `places` of directions without those of small parameters of which only a part was measured in time."""
-    counts = Counter(directions[place].key for place in places)
-    return [place for place in places
-            if directions[place].entry is None
-            or counts[directions[place].key] == measured[directions[place].key].value.size]  # fmt: skip
+def _complete(directions: Sequence[ParameterDirection], measured: Mapping[str, Measured]) -> list[int]:
+    """Return the places of all directions, except for small parameters of which only a part was measured in time."""
+    counts = Counter(each.key for each in directions)
+    return [place for place, each in enumerate(directions)
+            if each.entry is None or counts[each.key] == measured[each.key].value.size]  # fmt: skip
 
 
 def gradient_count(iterations: int) -> int:

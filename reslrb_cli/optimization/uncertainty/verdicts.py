@@ -310,8 +310,8 @@ def _left_by_others(
     found: Judged,
     maps: Sequence[Maps],
 ) -> dict[str, tuple[Array, str | None]]:
-    """Return the mean square offset (N,) of the entries of each texture that images do not determine, because other
-    parameters compensate for it, and the parameter that compensates for most of it.
+    """Return for each texture the mean square offset (N,) that images do not determine, because other parameters
+    compensate for it. Also return the parameter that compensates for most of it.
     """
     result: dict[str, tuple[Array, str | None]] = {}
     for each in maps:
