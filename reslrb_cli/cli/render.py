@@ -175,9 +175,12 @@ def _of_sensor(config: Config, sensor: int) -> Config:
     """Return the experiment with only the sensor `sensor`, even if the sensor's view is held out. The lamps of its view
     stay on.
     """
-    from reslrb_cli.optimization.loading import read_sensor_ids, view_sensors
+    from reslrb_cli.optimization.loading import find_sensor, read_sensor_ids, view_sensors
 
-    sensors = view_sensors(config, read_sensor_ids(config)) if config.views else []
+    ids = read_sensor_ids(config)
+    if not config.shares_sensors:
+        find_sensor(sensor, ids, "--sensor", "")
+    sensors = view_sensors(config, ids) if config.views else []
     known = dict(zip(sensors, config.views or (), strict=True))
     if config.shares_sensors and sensor not in known:
         raise ConfigError("--sensor", "", f"is {sensor}, but the experiment has {len(known)} views")

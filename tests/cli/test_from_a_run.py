@@ -319,7 +319,7 @@ def test_the_line_with_the_exposures(monkeypatch: pytest.MonkeyPatch, found: dic
     assert export.exposure_line(Path("run")) == said
 
 
-@pytest.mark.parametrize(("sensor", "lamps"), [(0, ["lamp"]), (2, None), (5, None)])
+@pytest.mark.parametrize(("sensor", "lamps"), [(0, ["lamp"]), (2, None), (1, None)])
 def test_one_view_keeps_its_lamps(
     folder: Path, monkeypatch: pytest.MonkeyPatch, sensor: int, lamps: list[str] | None
 ) -> None:

@@ -142,11 +142,12 @@ def me(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         raise SystemExit(code)
 
     reasons: list[str] = []
+    waits: list[float] = []
     made = SimpleNamespace(address="tls://here:1", local_directory=str(tmp_path), name=1, plugins={}, reasons=reasons,
-                           log_event=lambda topic, text: reasons.append(text))  # fmt: skip
+                           waits=waits, log_event=lambda topic, text: reasons.append(text))  # fmt: skip
     monkeypatch.setattr(calls, "get_worker", lambda: made)
     monkeypatch.setattr(calls.os, "_exit", end)
-    monkeypatch.setattr(calls, "SEND_S", 0.0)
+    monkeypatch.setattr(calls, "time", SimpleNamespace(sleep=waits.append, perf_counter=time.perf_counter))
     return made
 
 
@@ -180,8 +181,10 @@ def test_a_worker_reports_missing_requirements(me: SimpleNamespace, monkeypatch:
 
 
 def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
-    with pytest.raises(SystemExit):
+    """It leaves dask a second at least to send the reason. Its exit code is not 0, so that dask starts another one."""
+    with pytest.raises(SystemExit) as ended:
         uppercase(me, calls.Workload({}, reads))
+    assert (ended.value.code, [seconds >= 1 for seconds in me.waits]) == (1, [True])
     workload = calls.Workload({"a": b"one"}, reads)
     assert uppercase(me, workload) == "ONE"
     with pytest.raises(SystemExit):
@@ -195,6 +198,27 @@ def test_a_worker_ends_if_its_machine_fails(me: SimpleNamespace) -> None:
 
 def exhaust(state: object) -> None:
     raise MemoryError
+
+
+def test_a_call_has_a_limit(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[SimpleNamespace] = []
+
+    def timer(seconds: float, act: Callable[..., None], given: tuple[Any, ...]) -> SimpleNamespace:
+        made.append(SimpleNamespace(seconds=seconds, act=lambda: act(*given), done=[], daemon=False))
+        made[-1].start = lambda: made[-1].done.append("start")
+        made[-1].cancel = lambda: made[-1].done.append("cancel")
+        return made[-1]
+
+    monkeypatch.setattr(calls, "threading", SimpleNamespace(Timer=timer))
+    for failure in (None, ValueError("the user's")):
+        with suppress(ValueError), calls._guarded(me, 7.4):
+            assert (made[-1].seconds, made[-1].daemon, made[-1].done) == (7.4, True, ["start"])
+            if failure:
+                raise failure
+        assert (made[-1].done, me.reasons) == (["start", "cancel"], [])
+    with pytest.raises(SystemExit):
+        made[-1].act()
+    assert me.reasons == ["worker 1 (here) did not finish a call within 7 s; it is restarted"]
 
 
 def test_failures_of_workers_are_explained() -> None:
@@ -238,6 +262,31 @@ def test_workers_of_others_are_asked_for_code(
     workload = engine.workload_of(course, tmp_path, 2, own)
     assert (workload.arguments, workload.asks_for_code, workload.threads) == ((allowed,), asks, 2)
     assert (workload.files["state.npz"], set(workload.files)) == (b"state", {"state.npz", "targets.npz"})
+
+
+@pytest.mark.parametrize("in_rounds", [True, False])
+def test_a_worker_compiles_the_calls_of_a_step(monkeypatch: pytest.MonkeyPatch, in_rounds: bool) -> None:
+    """The third call of a function is the first one that only replays its kernels, so its time counts."""
+    done: list[tuple[Any, ...]] = []
+
+    def shard_image(problem: object, task: str) -> np.ndarray:
+        done.append((task,))
+        return np.ones((2, 2))
+
+    def shard_gradient(problem: object, task: str, delta: np.ndarray | None = None) -> None:
+        done.append((task, None if delta is None else delta.tolist()))
+
+    clock = iter([0.0, 9.0, 10.0, 15.0, 20.0, 21.0] * 2)
+    monkeypatch.setattr(engine, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(engine, "shard_image", shard_image)
+    monkeypatch.setattr(engine, "shard_gradient", shard_gradient)
+    monkeypatch.setattr(engine, "make_tasks", lambda problem, iteration: [iteration, "another"])
+    found = engine._warmed(SimpleNamespace(config=SimpleNamespace(in_rounds=in_rounds)))
+    if in_rounds:
+        assert found == {"shard_image": 1.0, "shard_gradient": 1.0}
+        assert done == [(0,)] * 4 + [(0, [[0, 0], [0, 0]])] * 3
+    else:
+        assert (found, done) == ({"shard_gradient": 1.0}, [(0, None)] * 3)
 
 
 def test_another_workload_is_refused(me: SimpleNamespace) -> None:
@@ -586,6 +635,15 @@ def test_two_signals_leave_no_files(experiment: Path, monkeypatch: pytest.Monkey
     assert list(place.iterdir()) == []
 
 
+def settings_of_a_worker(dask_worker: Any) -> tuple[list[object], list[object], object]:
+    """Return when a worker writes tasks to disk or waits, the pages that it serves, and its reaction to Ctrl-C."""
+    import dask
+
+    memory = dask_worker.memory_manager
+    limits = [memory.memory_target_fraction, memory.memory_spill_fraction, memory.memory_pause_fraction]
+    return limits, dask.config.get("distributed.worker.http.routes"), signal.getsignal(signal.SIGINT)
+
+
 def test_a_cluster_has_one_folder_and_one_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that ends at once removes this folder. The workers share the free memory of this machine."""
     place = made(tmp_path / "temporary")
@@ -595,6 +653,9 @@ def test_a_cluster_has_one_folder_and_one_memory(tmp_path: Path, monkeypatch: py
         client.wait_for_workers(2, timeout=60)
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         assert [worker["memory_limit"] for worker in workers] == [6 * 2**30] * 2
+        assert [*client.run(settings_of_a_worker).values()] == [([False] * 3, [], signal.SIG_IGN)] * 2
+        scheduler: Any = client.cluster.scheduler
+        assert scheduler.http_application.applications == []  # no pages
         assert list(place.iterdir()) == [folder]
         assert folder in atomic.unfinished
     assert folder not in atomic.unfinished

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -382,6 +383,23 @@ def test_unfinished_files_of_a_run_are_removed_at_its_end(run: Path, monkeypatch
     monkeypatch.setattr(recorder, "write_parameters", lambda *given: ((run / ".y.1.part").touch(), write(*given)))
     assert optimize("--resume", str(run), "--quiet") == 0
     assert list(run.rglob(".*.part")) == []
+
+
+@pytest.mark.parametrize("known", [{}, {"iterations": 7}])
+def test_an_abandoned_run_is_interrupted(tmp_path: Path, known: dict[str, int]) -> None:
+    """A folder that somebody has removed stays removed."""
+    ended: list[Any] = []
+    manifest = SimpleNamespace(results=dict(known), end_for_good=lambda *given: ended.append(given))
+    course = SimpleNamespace(last=SimpleNamespace(elapsed_s=2.5))
+    for is_there in (False, True):
+        folder = SimpleNamespace(path=tmp_path, is_there=is_there)
+        run: Any = SimpleNamespace(manifest=manifest, course=course, done=3, folder=folder)
+        recorder.Recording.abandon(run)
+        assert ended == [(tmp_path, "interrupted")] * is_there
+    assert manifest.results == (known or {"iterations": 3, "elapsed_s": 2.5})
+    course.last, manifest.results = None, {}
+    recorder.Recording.abandon(run)
+    assert manifest.results == {}
 
 
 def test_recovered_values_are_found_from_any_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

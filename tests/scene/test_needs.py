@@ -7,13 +7,14 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
 
 from reslrb_cli.errors import UnsupportedScene
-from reslrb_cli.scene import graph
+from reslrb_cli.scene import graph, rays
 from reslrb_cli.scene.catalog import summarise
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.needs import (
@@ -531,3 +532,37 @@ def test_beams_are_parallel_light_of_flat_faces(
     lamp = graph.Lamp(shape, None, 0, parallel, None)
     assert lamp.is_beam is beam
     assert lamp.surrounds is (kind == "Sphere" and not parallel)
+
+
+def test_rays_pass_hidden_lamps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ray that meets nothing, under a sky, has the emitter of the sky."""
+
+    def bounded(state: Any, condition: Any, body: Any, label: str) -> Any:
+        for _ in range(9):
+            if not dr.any(condition(*state)):
+                return state
+            state = body(*state)
+        raise AssertionError("the loop does not end")
+
+    monkeypatch.setattr(rays.dr, "while_loop", bounded)
+    at = mi.ScalarTransform4f().translate
+    lamp = {"type": "rectangle", "emitter": {"type": "area"}}
+    scene = mi.load_dict(
+        {"type": "scene", "sky": {"type": "constant"}, "near": {**lamp, "to_world": at([0, 0, 1])},
+         "far": {**lamp, "to_world": at([0, 0, 3])}, "wall": {"type": "rectangle", "to_world": at([0, 0, 5])},
+         "shade": {"type": "rectangle", "to_world": at([9, 0, 2])}}
+    )  # fmt: skip
+    origin = mi.Point3f([0, 0, 0, 9, 99, 0], 0, [0, 0, 2, 0, 0, 0])
+    ray = mi.Ray3f(origin, mi.Vector3f(0, 0, 1), 0, [])
+    ray.maxt = mi.Float(10, 2, 10, 10, 10, 10)
+    active = mi.Bool(True, True, True, True, True, False)
+    moved = rays.past_lamps(scene, ray, active)
+    start = [3, 1, 3, 0, 0, 0]
+    assert np.array(moved.o.z) == pytest.approx(start, abs=1e-3)
+    assert np.array(moved.o.z + moved.maxt) == pytest.approx(np.array(origin.z + ray.maxt), abs=1e-2)
+    si = dr.zeros(mi.SurfaceInteraction3f, 6)
+    si.p, si.n = origin, mi.Normal3f(0, 0, 1)
+    behind = mi.Point3f(origin.x, 0, [4, 6, 4, 4, 4, 6])
+    for has_edges in (False, True):
+        hidden = [np.array(rays.is_hidden(scene, si, behind, has_edges, active, passes)).tolist() for passes in (1, 0)]
+        assert hidden == [[False, True, False, True, False, False], [True, True, True, True, False, False]]

@@ -14,7 +14,7 @@ import pytest
 
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene import parameters, values
+from reslrb_cli.scene import parameters, upsampling, values
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
@@ -451,3 +451,21 @@ def test_a_start_lies_in_the_range_of_its_transform(transform: str, of_run: bool
         refused = pytest.raises(ConfigError, match="bounds: exclude the initial value")
         with contextlib.nullcontext() if 0.25 <= value <= 0.75 else refused:
             values.check_bounds(slot, np.float32([value]), (0.25, 0.75), place)
+
+
+def test_tied_colours_have_one_spectrum(llvm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Params(dict[str, Any]):
+        properties = property(lambda self: self)
+
+    monkeypatch.setattr(upsampling, "is_upsampled", lambda params, key: key != "number")
+    monkeypatch.setattr(upsampling, "colour_in_scene", lambda params, key: np.array(params[key]).ravel())
+    monkeypatch.setattr(upsampling, "coefficients", lambda rgb: 2 * rgb)
+    params = Params({name: mi.Color3f(1, 2, 3) for name in "abc"}, number=mi.Float(1))
+    colours = upsampling.Upsampling(params)
+    for key, others in (("c", []), ("a", ["b"]), ("a", ["c"]), ("number", []), ("gone", [])):
+        colours.add(key, others)
+    assert ("a" in colours, "b" in colours, colours.keys) == (True, False, ["c", "a", "b"])
+    colours["a"] = mi.Color3f(4, 5, 6)
+    assert len(colours.place()) == 3
+    shown = {name: np.array(value).ravel().tolist() for name, value in params.items()}
+    assert shown == {"a": [8, 10, 12], "b": [8, 10, 12], "c": [2, 4, 6], "number": [1]}

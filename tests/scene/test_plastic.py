@@ -13,6 +13,7 @@ from reslrb_cli.integrators.plugin import register
 from reslrb_cli.integrators.step import known_step
 from reslrb_cli.measure.gradients import Case, integrator
 from reslrb_cli.measure.scenes.small import rgb, room
+from reslrb_cli.scene import plastic as plastic_tables
 from reslrb_cli.scene.plastic import PlasticTables, tables, with_tables
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -65,6 +66,30 @@ def test_gradients_reach_the_tables(name: str, options: dict[str, Any]) -> None:
     made.collect()
     assert float(dr.grad(leaf)[0]) == pytest.approx(expected, rel=ROUNDING, abs=ROUNDING)
     assert plain != pytest.approx(expected, rel=0.05, abs=ROUNDING)  # Mitsuba's own derivative
+
+
+@pytest.mark.parametrize(("name", "alpha", "eta", "step"), [
+    ("alpha", 0.4, 1.5, 0.008), ("alpha", 0.05, 1.5, 0.005), ("eta", 0.4, 1.5, 0.015), ("eta", 0.4, 1.04, 0.005),
+    ("eta", 0.4, 0.96, 0.005),
+])  # fmt: skip
+def test_the_steps_of_the_slopes_are_small(
+    monkeypatch: pytest.MonkeyPatch, name: str, alpha: float, eta: float, step: float
+) -> None:
+    """They never reach a roughness of 0, or an index of 1."""
+    ends: list[list[float]] = []
+
+    def pretended(node: mi.BSDF) -> tuple[mi.Float, mi.Float]:
+        found = mi.traverse(node)
+        ends.append([float(found[key][0]) for key in ("alpha", "eta")])
+        product = ends[-1][0] * ends[-1][1]
+        return mi.Float(product), mi.Float(2 * product)
+
+    monkeypatch.setattr(plastic_tables, "tables", pretended)
+    slopes = plastic_tables._differences.__wrapped__("ggx", alpha, eta, name)
+    up, down = ([alpha + side, eta] if name == "alpha" else [alpha, eta + side] for side in (step, -step))
+    assert [*ends[0], *ends[1]] == pytest.approx([*up, *down], abs=1e-6)
+    slope = eta if name == "alpha" else alpha
+    assert [float(found[0]) for found in slopes] == pytest.approx([slope, 2 * slope], rel=1e-3)
 
 
 def test_without_derivatives_the_tables_are_mitsubas() -> None:
