@@ -70,7 +70,7 @@ render tiny.yaml -o gone/x.exr
 render tiny.yaml -o pipe.exr
 render tiny.yaml -o x.exr --sensor 7
 render tiny.yaml -o x.exr --sensor 0 --set 'scene.file=<mi.Scene>'
-render tiny.yaml -o x.exr --sensor 2 --set 'views=[{sensor: 0}, {sensor: 0, weight: 2}]'
+render tiny.yaml -o x.exr --sensor 2 --set 'views=[{sensor: 0}, {sensor: 0, lamps: [lamp]}]'
 render tiny.yaml -o x.exr --value k
 render tiny.yaml -o x.exr --value =1
 render tiny.yaml -o x.exr --value k=1 --value k=2
