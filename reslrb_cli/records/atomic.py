@@ -48,7 +48,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object], durable: 
         raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
+            part.unlink()
         unfinished.discard(part)
 
 
@@ -72,7 +72,7 @@ def remove_unfinished() -> None:
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:
-                path.unlink(missing_ok=True)
+                path.unlink()
 
 
 def remove_parts(folder: Path) -> None:

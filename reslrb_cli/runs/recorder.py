@@ -250,7 +250,7 @@ class Recording:
             if failure is None:
                 logger.warning("the page was not written: %s; the rest is in %s", describe(error), self.folder.path)
             with contextlib.suppress(OSError):  # the previous page shows the run as still running
-                (self.folder.path / "report.html").unlink(missing_ok=True)
+                (self.folder.path / "report.html").unlink()
         remove_parts(self.folder.path)
         if failure is not None:
             raise failure
