@@ -167,6 +167,11 @@ class Config(Section):
         return self.views is not None and len({view.sensor for view in self.views}) < len(self.views)
 
     @property
+    def names_lamps(self) -> bool:
+        """True if a view names the lamps that are on."""
+        return any(view.lamps is not None for view in self.views or ())
+
+    @property
     def drawn_views(self) -> int | None:
         """Number of views in an iteration, or None if only the scene determines it."""
         if self.views is None and self.scene.cameras is not None:

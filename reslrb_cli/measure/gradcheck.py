@@ -119,8 +119,16 @@ class Gradcheck:
         roulette = f"roulette from depth {integrator.rr_depth}" if plays else "no roulette"
         return (
             f"{self.settings.config.source}, film {width}x{height}, {parts.spp} spp "
-            f"({width * height * parts.spp} paths a seed), max_depth {integrator.max_depth}, {roulette}"
+            f"({width * height * parts.spp} paths a seed), max_depth {integrator.max_depth}, {roulette}{self._lamps()}"
         )
+
+    def _lamps(self) -> str:
+        """Return which lamps are on, in words, if views name their lamps."""
+        views = self.settings.config.views
+        if views is None or not self.settings.config.names_lamps:
+            return ""
+        lamps = f"the lamps {', '.join(views[0].lamps or ())}" if self.participants.lit else "all lamps"
+        return f", the first view with {lamps}"
 
     def run(
         self, stop: Callable[[], bool], say: Callable[[str], None], between: Callable[[], None] = lambda: None

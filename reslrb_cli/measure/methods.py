@@ -60,11 +60,14 @@ class NamedIntegrator:
     options: dict[str, Any]
     source: str = _OPTION
 
-    def at(self, config: Config, max_depth: int, known: bool, auto: bool = False) -> Config:
+    def at(
+        self, config: Config, max_depth: int, known: bool, auto: bool = False, has_lamps: bool = False
+    ) -> Config:  # fmt: skip
         """Return the experiment with this integrator at this depth. Raises ConfigError if the integrator is invalid.
 
         `known` tells whether dL/dI is known before the image, so that `run.adjoint` has no effect. If the argument
-        `auto` is True, options may have the value `auto`, as in whole runs.
+        `auto` is True, options may have the value `auto`, as in whole runs. Otherwise, and if views name their lamps,
+        the experiment has its first view alone. All lamps are on, or with `has_lamps` those of the view.
         """
         blame = f"{self.source} {self.label}"
         adjoint = {name: value for name, value in self.options.items() if name in ADJOINT}
@@ -92,7 +95,7 @@ class NamedIntegrator:
             if values.get(option) == "auto" and not auto:
                 raise ConfigError(blame, option, f"`auto` is for whole runs; use `{fixed}`, or another value")
         if not auto:
-            config = _with_all_lamps(config)
+            config = _with_first_view(config, has_lamps)
         made = with_integrator(config, values | {"max_depth": max_depth}, blame, adjoint)
         if getattr(made.integrator, "file", None) is not None and not config.allows_code:
             raise ConfigError(blame, "", "would run with all your rights; --allow-code permits it")
@@ -171,15 +174,16 @@ def all_estimators(config: Config) -> list[NamedIntegrator]:
     return cases
 
 
-def _with_all_lamps(config: Config) -> Config:
-    """Return the experiment with its first view alone and all lamps on, if views name their lamps. Stock integrators
-    cannot switch lamps off.
+def _with_first_view(config: Config, has_lamps: bool) -> Config:
+    """Return the experiment with its first view alone, if views name their lamps. All lamps are on unless `has_lamps`
+    is true, because stock integrators cannot switch lamps off.
     """
-    if config.views is None or all(view.lamps is None for view in config.views):
+    if config.views is None or not config.names_lamps:
         return config
+    view = config.views[0]
     return config.model_copy(
         update={
-            "views": [config.views[0].model_copy(update={"lamps": None})],
+            "views": [view if has_lamps else view.model_copy(update={"lamps": None})],
             "run": config.run.model_copy(update={"held_out": [], "views_per_iteration": None}),
         }
     )

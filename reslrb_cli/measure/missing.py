@@ -50,6 +50,7 @@ from reslrb_cli.measure.participants import PATHS
 from reslrb_cli.measure.references import ends
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import as_decided, is_auto
+from reslrb_cli.optimization.loading import with_lamps_of_views
 from reslrb_cli.optimization.memory import pixels_of
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
@@ -265,14 +266,17 @@ class MissingCheck:
         """Return the check of the command `gradcheck --missing`. A variant must be set. Raises ConfigError and
         UnsupportedScene.
         """
-        depth, own = config.integrator.max_depth, config.integrator.options()
-        [listed] = parse_cases(ESTIMATOR + ("(paths=auto)" if own.get("paths", "auto") == "auto" else ""))
+        depth, asked = config.integrator.max_depth, config.integrator.options()
+        [listed] = parse_cases(ESTIMATOR + ("(paths=auto)" if asked.get("paths", "auto") == "auto" else ""))
         problem = assemble(listed.at(config, depth, known=True, auto=True).with_exposures_fixed())
         options = problem.config.integrator.options() | {"paths": problem.paths}
-        options["edges"] = "off" if own.get("edges") == "off" else "on"
+        options["edges"] = "off" if asked.get("edges") == "off" else "on"
         shared = {name: options[name] for name in ("max_depth", "hide_emitters")} | {"paths": problem.paths}
-        images = make_integrator("walk_ad", **shared, rr_depth=NEVER if ends(depth) else options["rr_depth"])
-        gradients = make_integrator("reslrb", **options, freeze=True)
+        never = NEVER if ends(depth) else options["rr_depth"]
+        images, gradients = (
+            with_lamps_of_views(problem.config, type, make_integrator(type, **own), problem.scene)
+            for type, own in (("walk_ad", {**shared, "rr_depth": never}), ("reslrb", {**options, "freeze": True}))
+        )  # fmt: skip
         [pixels] = pixels_of(problem.scene, problem.sensors[:1])
         spp, image_spp = spp or max(PATHS // pixels, 1), max(IMAGE_PATHS // pixels, 1)
         return cls(problem, problem.selection.keys, problem.views[:1], images, gradients, spp, image_spp)

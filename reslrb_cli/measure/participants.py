@@ -32,7 +32,7 @@ from reslrb_cli.measure.references import (
 )
 from reslrb_cli.measure.scenes import small
 from reslrb_cli.optimization.assemble import assemble_scene
-from reslrb_cli.optimization.loading import check_integrator, paths_of, what_moves
+from reslrb_cli.optimization.loading import check_integrator, lit_emitters, paths_of, what_moves
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.targets import multiple_of
 from reslrb_cli.records.measurements import Reference
@@ -115,7 +115,10 @@ class CheckSettings:
         if integrator.options().get("edges") == "on":  # only differences have the derivatives of edges
             config = config.model_copy(update={"integrator": integrator.model_copy(update={"edges": "off"})})
         depth = integrator.max_depth
-        self.configs = {case.label: case.at(config, depth, self.known) for case in self.integrators}
+        has_lamps = all(case.type == "reslrb" for case in self.integrators)  # the user's own cannot switch lamps off
+        self.configs = {
+            case.label: case.at(config, depth, self.known, has_lamps=has_lamps) for case in self.integrators
+        }
 
 
 @dataclass(frozen=True)
@@ -159,6 +162,7 @@ class Participants:
     - `unguided` has the integrator of the unguided steps, by the label of each estimator that a run would or may guide.
     - `forward_mode` tells whether there is a forward mode. Moving emitters have none.
     - `masked` tells whether images and their references leave out the film's border.
+    - `lit` has the indices of the emitters that are on, by sensor, if others are off.
 
     Raises ConfigError and UnsupportedScene.
     """
@@ -172,6 +176,7 @@ class Participants:
         problem = assemble_scene(first, small.build(self._config.scene.options) if built_in else None)
         scene, sensor = problem.scene, problem.sensors[0]
         shrink(scene, sensor, PATHS)
+        self.lit = lit_emitters(first, scene)
         self.case = Case(scene, problem.selection.keys, sensor, problem.selection)
         self.sensor = scene.sensors()[sensor]
         self.film: tuple[int, int] = (self.case.weights.shape[1], self.case.weights.shape[0])
@@ -269,7 +274,8 @@ class Participants:
         return "light paths lack terms of moving meshes with interpolated normals; paths=both and camera have them"
 
     def _add(self, label: str, kind: str, config: Config | None = None, **options: Any) -> None:
-        self.integrators[label] = make_integrator(kind, **options)
+        made = make_integrator(kind, **options)
+        self.integrators[label] = made.lit_by(self.lit) if self.lit and isinstance(made, LightTracer) else made
         self._origins[label] = config or self._config, {"type": kind} | options
 
     def _add_listed(self, case: NamedIntegrator) -> None:
@@ -291,7 +297,7 @@ class Participants:
             if (place := getattr(config.integrator, "file", None)) is not None:
                 load_estimator(place, "--integrators", label)
         self._add(label, kind, config, **options)
-        if case.options.get("guiding", asked) != "off" and self.ways[label].paths != "camera":
+        if case.options.get("guiding", asked) != "off" and self.ways[label].paths != "camera" and not self.lit:
             self.unguided[label] = label if guiding == "off" else f"{label}, unguided"
             self._add(_alike(label, Reference.UNGUIDED), kind, config, **options | {"guiding": "on"})
             self._add(self.unguided[label], kind, config, **options | {"guiding": "off"})
@@ -379,6 +385,7 @@ class Participants:
         arrays = [np.array(self.case.weights), *(direction.vector for direction in self.directions.get(of, ()))]
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
         own = {"integrator": options, "spp": self.spp, "known": self.known, "masked": self.masked, "arrays": digest}
+        own |= {"lit": self.lit} if self.lit else {}
         return situation(config, mi.variant(), purpose=f"gradcheck, {kind} {of}", **own)
 
     def steps(self, of: str) -> list[tuple[float, float]]:

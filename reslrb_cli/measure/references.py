@@ -19,6 +19,7 @@ import numpy as np
 
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.measure.scenes.analytic import furnace
+from reslrb_cli.optimization.loading import lit_emitters
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurements import Reference
 from reslrb_cli.scene.catalog import parameter_kind
@@ -75,8 +76,8 @@ class Situation:
     """The conditions for references: a scene and a sensor, the maximum depth, and whether emitters are hidden.
 
     `attached` tells whether derivatives are attached. `moved` has the recovered parameters that move light. `paths`
-    (`light`, `camera`, `both`) are the kinds of paths that the estimator traces. A valid reference contains exactly the
-    same light as the estimator.
+    (`light`, `camera`, `both`) are the kinds of paths that the estimator traces. `lit` has the indices of the emitters
+    that are on, if others are off. A valid reference contains exactly the same light as the estimator.
     """
 
     scene: Any
@@ -89,15 +90,16 @@ class Situation:
     attached: bool = False
     moved: tuple[str, ...] = ()
     paths: str = "light"
+    lit: tuple[int, ...] | None = None
 
     @classmethod
     def of(
         cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, attached: bool = False,
-        moved: tuple[str, ...] = (), paths: str = "light",
+        moved: tuple[str, ...] = (), paths: str = "light", lit: tuple[int, ...] | None = None,
     ) -> Situation:  # fmt: skip
         """Return the `Situation` of a loaded scene. `params` is the result of `mi.traverse` for the scene."""
-        graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor), look(scene, sensor)
-        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved, paths)
+        graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor, lit), look(scene, sensor)
+        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved, paths, lit)
 
     @classmethod
     def of_problem(cls, problem: Problem, sensor: int) -> Situation:
@@ -108,7 +110,8 @@ class Situation:
         depth, hidden = options["max_depth"], options["hide_emitters"]
         # Stock integrators in the problem itself are compared like light paths.
         paths = problem.paths if problem.config.integrator.type == "reslrb" else "light"
-        return cls.of(problem.scene, seen, params, depth, hidden, attached, moved, paths)
+        lit = lit_emitters(problem.config, problem.scene).get(sensor)
+        return cls.of(problem.scene, seen, params, depth, hidden, attached, moved, paths, lit)
 
     @property
     def has_pointlike(self) -> bool:
@@ -188,7 +191,9 @@ def path_image(at: Situation) -> str | None:
 
 
 def _wrong_everywhere(at: Situation) -> str | None:
-    """Return a part of the scene that all stock integrators render wrongly, as a reason, or None."""
+    """Return what all stock integrators render wrongly in the scene, as a reason, or None."""
+    if at.lit is not None:
+        return "it cannot switch lamps off"
     if at.needs.blends:
         return "it renders blends of singular and smooth lobes wrongly"
     if any(lamp.shared for lamp in at.needs.lamps):

@@ -311,12 +311,19 @@ def make_configured(config: Config, integrator: Integrator, paths: str, scene: m
             load_estimator(integrator.file, config.source, "integrator.estimator")
     if isinstance(integrator, Own):
         options["allowed"] = config.allows_code
-    made, lit = make_integrator(integrator.type, **options), lit_emitters(config, scene)
+    return with_lamps_of_views(config, integrator.type, make_integrator(integrator.type, **options), scene)
+
+
+def with_lamps_of_views(config: Config, type: str, made: StepIntegrator, scene: mi.Scene) -> StepIntegrator:
+    """Return an integrator of this `type` for which only the lamps of each view are on. Raises ConfigError if there is
+    none.
+    """
+    lit = lit_emitters(config, scene)
     if not lit:
         return made
     if not isinstance(made, LightTracer):
         place = next(number for number, view in enumerate(config.views or ()) if view.lamps is not None)
-        reason = f"lights only some lamps, which {integrator.type} cannot do; use integrator.type: reslrb"
+        reason = f"lights only some lamps, which {type} cannot do; use integrator.type: reslrb"
         raise ConfigError(config.source, f"views[{place}].lamps", reason)
     if made.preparation.guiding is not None:
         reason = "is on, but views with different `lamps` cannot share its tables; use off"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import colour
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +14,10 @@ from optimization.toy import make_problem
 
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.measure.methods import parse_cases
+from reslrb_cli.measure.gradcheck import Gradcheck
+from reslrb_cli.measure.methods import parse_cases, parse_checked
+from reslrb_cli.measure.missing import MissingCheck
+from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.optimization import loop
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.loop import optimize
@@ -180,6 +185,44 @@ def test_measurements_have_the_first_view_with_all_lamps(lamps, method):
     np.testing.assert_array_equal(np.array(measured.views[0].target), np.array(plain.views[0].target))
     whole = case.at(problem.config, 3, known=False, auto=True)
     assert whole.views == problem.config.views
+
+
+def test_gradcheck_has_the_lamps_of_the_first_view(lamps):
+    """The images are those of the view, and naive AD traces the same paths."""
+    problem = make(lamps, ONE_BY_ONE, "run.shards=1", "target.render.spp=256")
+    size = np.array(problem.views[0].target).mean()
+    check = Gradcheck(CheckSettings(problem.config, parse_checked("reslrb:stack"), 0, 3, spp=64))
+    parts = check.participants
+    assert check.conditions().endswith(", the first view with the lamps led0")
+    assert [(one, why.count("it cannot switch lamps off")) for one, why in parts.images.values()] == [(None, 3)]
+    for name in ("walk_ad", "differenced", "reslrb:stack"):
+        assert parts.sample("image", name, 1).mean() == pytest.approx(size, rel=0.1)
+    ours, naive = (parts.sample("gradient", name, 1) for name in ("reslrb:stack", "walk_ad"))
+    np.testing.assert_allclose(ours, naive, rtol=1e-4, atol=1e-5 * np.abs(naive).max())
+    missing = MissingCheck.of_config(problem.config, 64).tracing
+    for tracer in (missing.images, missing.gradients):
+        assert missing.cases[0].image(tracer, 1, 64).mean() == pytest.approx(size, rel=0.1)
+
+
+def test_own_integrators_are_checked_with_all_lamps(lamps):
+    config = make(lamps, ONE_BY_ONE, "run.shards=1").config.with_code(True)
+    own = Path(__file__).parents[1] / "measure" / "own_replay.py"
+    for names, lit in ((f"reslrb:stack,{own}:Replay", None), ("reslrb:stack", ["led0"])):
+        configs = CheckSettings(config, parse_checked(names), 0).configs
+        assert [each.views[0].lamps for each in configs.values()] == [lit] * len(configs)
+
+
+SPOT = """<emitter type="spot" id="spot{0}"><float name="cutoff_angle" value="8"/>
+    <transform name="to_world"><lookat origin="{0}, {0}, 3" target="{0}, {0}, 0" up="0, 1, 0"/></transform></emitter>"""
+
+
+def test_texels_that_only_unlit_lamps_reach_do_not_count(folder):
+    """Each spot lights one corner of the wall."""
+    text = scene_seen(EYES[0]).replace("</scene>", SPOT.format(-0.5) + SPOT.format(0.5) + "</scene>")
+    (folder / "scene.xml").write_text(text)
+    mask = assemble(load(folder / "tiny.yaml", ["views=[{lamps: [spot0.5]}]"]), to_run=True).masks[KEY]
+    assert mask.any()
+    assert not (mask[:, :2].any() and mask[:, 2:].any())
 
 
 def test_render_shows_a_view_with_its_lamps(lamps, monkeypatch):
