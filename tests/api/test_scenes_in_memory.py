@@ -124,6 +124,14 @@ def test_dictionaries_with_equal_bytes_in_other_shapes_are_apart(folder: Path) -
         assert read_stored(image).pixels.shape == shape
 
 
+def test_a_dictionary_that_is_nested_too_deeply_is_one_line(folder: Path) -> None:
+    bsdf: dict[str, Any] = {"type": "diffuse"}
+    for _ in range(2000):
+        bsdf = {"type": "twosided", "inside": bsdf}
+    with pytest.raises(rl.ConfigError, match=r"^<dict>: scene: is nested too deeply$"):
+        write_dictionary(room(floor={"type": "rectangle", "bsdf": bsdf}), "<dict>", folder)
+
+
 def test_writing_a_scene_removes_old_ones(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def written(radius: float) -> Path:
         return write_dictionary(room(ball={"type": "sphere", "radius": radius}), "<dict>", folder).parent

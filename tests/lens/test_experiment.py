@@ -6,6 +6,7 @@ import io
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -111,6 +112,16 @@ def test_the_bar_of_the_stages_begins_at_0_and_stays_within_100_percent(monkeypa
             tell(f"stage {stage}")
     shares = [int(share) for share in re.findall(r"(\d+)%\|.*?stage", terminal.getvalue())]
     assert shares == [0, 33, 67, 100, 100, 100]
+
+
+def test_long_stages_are_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream, clock = io.StringIO(), iter([100.0, 104.0, 106.0, 106.0, 108.0])
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr("reslrb_cli.cli.lens.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    with show_stages(3) as tell:
+        for stage in ("floor", "grid", "solid"):
+            tell(stage)
+    assert stream.getvalue() == "grid ...\n"
 
 
 def test_transparent_parts_of_a_picture_of_floats_are_white(tmp_path: Path) -> None:
