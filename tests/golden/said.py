@@ -77,8 +77,8 @@ OTHERS = {
 }
 #: Folders of other fixtures.
 _TEMPORARY = re.compile(r"/\S*/pytest-of-\w+/pytest-\d+/(popen-gw\d+/)?")
-#: Lines about the variant, and about progress.
-_PASSING = re.compile(r"variant |\d+/\d+: ")
+#: Lines about the variant, and about progress. A slow machine prints the stages of `lens`.
+_PASSING = re.compile(r"variant |\d+/\d+: |(grid of \d+x\d+|floor of [\d.]+ %|solid) \.\.\.$")
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT[\d:+]+|\b\d+\.\d+ s\b|\b\d+ MiB\b")
 
 
