@@ -32,7 +32,9 @@ from reslrb_cli.records import (
     sweeps,
     tree,
 )
+from reslrb_cli.records import manifest as manifests
 from reslrb_cli.report import run_summary
+from reslrb_cli.runs import export as exports
 from reslrb_cli.runs import log, loggers, prepare, search, workshop
 from reslrb_cli.runs import sweep as planned
 from reslrb_cli.scene import cameras, catalog, deformation, edges, graph, proposal, rays, upsampling, values, visibility
@@ -149,6 +151,14 @@ HORIZON.holds(mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])), HORIZON.holds(mi
 [sweeps.SweepRunRecord("a", {}, 0, status).is_done for status in ("finished", "interrupted", "running", "failed", "waiting")]
 [terminal_line(is_terminal) for is_terminal in (True, False)]
 tree.to_array(mi.Float(3)), tree.like(2.0, np.array(3)), tree.like(mi.Color3f(0), np.float32([[1], [2], [3]])), tree.expected((2, 3))
+[exported(*given) for given in ((".", False), (".", True), ("new", False), ("full", False), ("file", False), ("link", False), ("a.STL", False))]
+[started_by(**given) for given in ({}, dict(codes={"a": "b"}), dict(manifest={}), dict(manifest={}, state=True), dict(state=True), dict(manifest={}, state=True, codes={"a": "b"}), dict(other=True), dict(statuses=["running"] * 2 + ["failed"]), dict(statuses=["running"] * 9))]
+[grown(*given) for given in ((None, None), (3, None), (2, None), (1, None), (334, None), (333, None), (None, 4), (4, 300))]
+[grown(*given, searched=True) for given in ((None, None), (None, 4), (None, 5), (None, 3), (None, 500), (None, 501), (3, 5))]
+[left(*given) for given in ((None, False), ("finished", False), ("interrupted", False), ("failed", False), ("failed", True))]
+[planned._bounded(name)[-9:] for name in ("a" * 400, "ä" * 400, "a/b")], len(planned._bounded("a" * 400))
+[catalog._spectral_obstacle(node(kind), key) for kind, key in (("D65Spectrum", "a.d65.values"), ("IrregularSpectrum", "a.wavelengths"), ("IrregularSpectrum", "a.values"), ("BlackBodySpectrum", "a.temperature"), ("EnvironmentMapEmitter", "a.data"), ("EnvironmentMapEmitter", "a.scale"), ("Sphere", "a.vertex_color"))]
+[str(manifests.commit_of(Path(folder))) for folder in ("/", "/gone", "a" + chr(0))]
 jobs._PROGRESS.match("3/40: loss") is not None, jobs._PROGRESS.match("loss 3/4: x") is None
 """.strip().split("\n")  # noqa: E501
 CHECKS = np.indices((8, 8)).sum(0) % 3 + 0.5
@@ -214,6 +224,68 @@ def ball() -> edges.Ball:
 
 def params_of(value: Any) -> Any:
     return SimpleNamespace(properties={"k": (value, None, None, 0)})
+
+
+def exported(name: str, tolerances: bool) -> str:
+    """Return why the folder `name` is refused for an export, or an empty text."""
+    Path("full/a").mkdir(parents=True, exist_ok=True)
+    Path("file").touch()
+    if not Path("link").is_symlink():
+        Path("link").symlink_to("full/a")
+    try:
+        exports.check_export(SimpleNamespace(fabrication=None), Path("full/a") / name if name == "." else Path(name),
+                             tolerances)  # type: ignore[arg-type]  # fmt: skip
+    except errors.ConfigError as error:
+        return str(error)
+    return ""
+
+
+def started_by(
+    manifest: dict[str, Any] | None = None, statuses: list[str] | None = None, **more: Any
+) -> tuple[list[str], bool, str]:
+    """Return the words that start the run of a sweep, whether its folder is there, and the error."""
+    reads = [*({"status": status} for status in statuses or ())]
+    clock = iter(range(0, 1000, 5))
+    combination = sweeps.Combination("a=1", {})
+    run = Path("s/a=1-seed=3")
+    if run.exists():
+        run.rmdir()
+    if manifest is not None or more.get("state") or more.get("other"):
+        run.mkdir(parents=True)
+    plan: Any = SimpleNamespace(codes=more.get("codes", {}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planned, "newest_checkpoint", lambda folder: folder if more.get("state") else None)
+        patch.setattr(planned, "read_manifest", lambda folder: reads.pop(0) if reads else manifest)
+        patch.setattr(planned, "time", SimpleNamespace(monotonic=lambda: next(clock), sleep=lambda seconds: None))
+        try:
+            words, error = planned.command(Path("s"), plan, combination, 3), ""
+        except errors.ConfigError as raised:
+            words, error = [], str(raised)
+    here = str(Path.cwd())
+    return [word.replace(here, "HERE") for word in words], run.exists(), error.replace(here, "HERE")
+
+
+def grown(seeds: int | None, trials: int | None, searched: bool = False) -> Any:
+    """Return the seeds and the trials of a sweep of 3 combinations and 2 seeds that gets more, or the error."""
+    asked = sweeps.SweepSearch(4, {}) if searched else None
+    three = [sweeps.Combination(name, {}) for name in "abc"]
+    try:
+        found = planned._grown(sweeps.SweepPlan("c", [], three, [3, 4], search=asked), seeds, trials)
+    except errors.ConfigError as error:
+        return str(error)
+    return [len(found.seeds), found.seeds[0], found.search and found.search.trials]
+
+
+def left(status: str | None, has_failed: bool) -> bool:
+    """Return whether a run of a sweep is left to do."""
+    plan: Any = SimpleNamespace(failures={"a": 1} if has_failed else {})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planned, "read_manifest", lambda folder: status and {"status": status})
+        return planned.is_left(Path("s"), plan, "a")
+
+
+def node(kind: str) -> Any:
+    return SimpleNamespace(class_name=lambda: kind)
 
 
 def bar_text(columns: int | None) -> list[Any]:

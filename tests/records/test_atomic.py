@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import shutil
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.records import checkpoint
+from reslrb_cli.records import checkpoint, measurement_files, sweeps
 from reslrb_cli.records.atomic import remove_parts, remove_unfinished, unfinished_folder, write_atomically, writing
 from reslrb_cli.records.checkpoint import newest_checkpoint, open_archive, read_state, save_checkpoint
 from reslrb_cli.records.images import MOST_BYTES, file_stem
@@ -254,3 +255,27 @@ def test_similar_keys_have_distinct_file_names() -> None:
     assert [file_stem(key) for key in ("a_b", "Wände.alpha-2")] == ["a_b", "Wände.alpha-2"]
     assert file_stem("a b").startswith("a_b-")
     assert file_stem("a b") == file_stem("a b")
+
+
+@pytest.mark.parametrize(("number", "kept"), [(errno.EACCES, True), (errno.EXDEV, True), (errno.ENOSPC, False)])
+def test_a_file_that_cannot_be_replaced_is_written_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kept: bool
+) -> None:
+    def refuse(path: Path, write: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(measurement_files, "write_atomically", refuse)
+    with contextlib.nullcontext() if kept else pytest.raises(OSError, match="No space"):  # type: ignore[attr-defined]
+        write_lines(tmp_path / "a", [Origin("cpu", "llvm_ad_rgb")])
+    assert (tmp_path / "a").exists() is kept
+
+
+def test_the_plan_of_a_sweep_survives_a_loss_of_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[object] = []
+
+    def write(path: Path, write: object, durable: bool = False) -> None:
+        given.append((path.name, durable))
+
+    monkeypatch.setattr(sweeps, "write_atomically", write)
+    sweeps.SweepPlan("c", [], [], [3]).write(tmp_path)
+    assert given == [("sweep.json", True)]

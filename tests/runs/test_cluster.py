@@ -222,15 +222,53 @@ def test_a_call_has_a_limit(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 
 
 def test_failures_of_workers_are_explained() -> None:
-    from distributed import KilledWorker
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm import CommClosedError
+    from distributed.scheduler import NoWorkerError
 
     workers = calls.Workers.__new__(calls.Workers)
     killed = KilledWorker("a", SimpleNamespace(address="tls://here:1"), 3)
-    for error, text in ((killed, "the same call ended 4 workers, the last one at tls://here:1; see their warnings"),
-                        (TimeoutError(), f"no worker within {calls.NOBODY_S} s"),
-                        (MachineError("worker 1 fails"), "worker 1 fails")):  # fmt: skip
-        with pytest.raises(MachineError, match=f"--cluster: {text}"), workers._explained():
+    ended = "the scheduler has ended; --resume continues the run"
+    for status, error, text in (
+        ("running", killed, "the same call ended 4 workers, the last one at tls://here:1; see their warnings"),
+        ("running", TimeoutError(), f"no worker within {calls.NOBODY_S} s"),
+        ("running", NoWorkerError(None, 3), f"no worker within {calls.NOBODY_S} s"),
+        ("running", MachineError("worker 1 fails"), "worker 1 fails"), ("running", CancelledError(), ended),
+        ("running", CommClosedError(), ended), ("closed", ValueError(), ended),
+    ):  # fmt: skip
+        workers._client = SimpleNamespace(status=status)
+        with pytest.raises(MachineError, match=f"^--cluster: {text}"), workers._explained():
             raise error
+    workers._client.status = "running"
+    with pytest.raises(ValueError, match="of the user"), workers._explained():
+        raise ValueError("of the user")
+
+
+def test_failures_of_connections_are_explained(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The folder is removed then, too."""
+    import distributed
+
+    given: dict[str, Any] = {}
+
+    def refuse(*_: object, **options: Any) -> None:
+        given.update(options)
+        raise OSError("Timed out") from ValueError("bad certificate")
+
+    place = made(tmp_path / "temporary")
+    monkeypatch.setattr(tempfile, "tempdir", str(place))
+    monkeypatch.setattr(distributed, "Client", refuse)
+    monkeypatch.setattr(distributed, "LocalCluster", refuse)
+    monkeypatch.setattr(connection, "_certificates", lambda: None)
+    monkeypatch.setattr("reslrb_cli.backend.doctor.free_bytes", lambda variant: 12 * 2**30)
+    refused = "the scheduler at tls://a:1 cannot be reached, or refuses this certificate: bad certificate"
+    for cluster, text in ((Cluster(3), "no workers could be started: Timed out"),
+                          (Cluster(address="tls://a:1"), refused)):  # fmt: skip
+        with pytest.raises(MachineError, match=f"^--cluster: {text}$"), connected(cluster):
+            pass
+        assert list(place.iterdir()) == []
+    asked = {"n_workers": 3, "threads_per_worker": 1, "processes": True, "security": None, "protocol": "tls://",
+             "memory_limit": 4 * 2**30, "direct_to_workers": False, "set_as_default": False}  # fmt: skip
+    assert {name: given[name] for name in asked} == asked
 
 
 def test_calls_have_more_time_than_the_longest_one(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -17,6 +18,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.catalog import list_parameters
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.load import load_scene
+from reslrb_cli.scene.xml import mend
 from reslrb_cli.scene.xml.mend import upsample_bitmaps
 from reslrb_cli.scene.xml.read import read_description
 
@@ -577,3 +579,17 @@ def test_an_obj_file_with_several_materials_is_named(uses, warned, tmp_path, cap
     load_scene(write(tmp_path, shape='<shape type="obj"><string name="filename" value="m.obj"/></shape>'))
     line = "`m.obj` has the materials `a`, `b`, and Mitsuba ignores `usemtl` and .mtl files: read as one surface"
     assert (line in caplog.text) is warned
+
+
+@pytest.mark.parametrize(("names", "more"), [
+    ([], None), (["a"], ""), (["a", "a"], ""), (["a", "b"], ", and 1 other names likewise"),
+    (["a", "b", "c"], ", and 2 other names likewise"),
+])  # fmt: skip
+def test_other_renamed_parameters_are_counted(names: list[str], more: str | None) -> None:
+    description: Any = SimpleNamespace(files={"old.xml": "0.6.0", "new.xml": "3.0.0", "older.xml": "0.5.0"})
+    mended = mend._Mender(description)
+    mended._renamed = [
+        SimpleNamespace(written=name, name=f"new_{name}", file=file) for file in mended.old[:1] for name in names
+    ]  # type: ignore[misc]
+    assert mended.old == ["old.xml", "older.xml"]
+    assert [note.done for note in mended.renamed()] == ([] if more is None else [f"read as `new_a`{more}"])

@@ -90,14 +90,19 @@ def png(width, height, depth=8, kind=2, data=b"", more=b""):
     return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
 
 
-def exr(right, bottom):
+def exr(right, bottom, left=0, top=0):
     """Return the head of an EXR file whose data window ends at pixel (`right`, `bottom`)."""
 
     def attribute(name, kind, content):
         return name + b"\0" + kind + b"\0" + struct.pack("<i", len(content)) + content
 
-    window = struct.pack("<4i", 0, 0, right, bottom)
+    window = struct.pack("<4i", left, top, right, bottom)
     return b"\x76\x2f\x31\x01\x02\0\0\0" + attribute(b"dataWindow", b"box2i", window) + b"\0"
+
+
+@pytest.mark.parametrize(("left", "top"), [(0, 0), (3, 5), (-3, -5)])
+def test_the_window_of_an_exr_can_begin_anywhere(left, top, tmp_path):
+    assert images._exr(tmp_path / "a.exr", io.BytesIO(exr(left + 6, top + 9, left, top))).size == (7, 10)
 
 
 @pytest.mark.parametrize(
