@@ -63,6 +63,9 @@ measurements.Spread.of([3, 1, 2]), measurements.Band.of([3.0, 1.0]), measurement
 [missing(share, 0.01, n).line() for share in (None, 0.0, 5e-5, 0.3) for n in (0, 2, 8)]
 missing(0.3, None, 8).line(), missing(0.3, None, 8).percent(), missing(0.3, 0.02, 1).margin
 [missing(0.3, 0.01).is_reduced_to(missing(other, error)) for other, error in ((0.2, 0.01), (0.28, 0.01), (0.3, 0.1), (None, None))]
+[[share, error, *judged(share, error)] for share, error in ((0.0, 0.0), (0.0, 0.03), (0.05, 0.0), (0.5, 0.0), (1e-4, 0.0))]
+[missing(share, 0.0).line() for share in (0.0, 1e-4, 1.1e-4)], missing(0.25, 0.06).is_reduced_to(missing(0.05, 0.08))
+[str(missing(0.3, error, n).margin) for error, n in ((0.01, 0), (0.01, 1), (0.01, 2), (None, 9), (0.0, 2))]
 missing(0.3, 0.01).is_reduced_to(None), missing(None, None).is_reduced_to(missing(0.3, 0.01))
 [metrics.finite({"a": [1.0, math.inf, (math.nan, 2)], "b": "x"}), metrics.finite(math.inf, str)]
 [metrics._iteration_of(line) for line in (b'{"iteration": 3}', b'{"iteration": 3}\\n', b'{"iteration": "3"}\\n', b"[1]\\n", b"{}\\n")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import enum
 import importlib
 import inspect
@@ -73,6 +74,9 @@ def written_in(module: ModuleType) -> dict[str, Any]:
             found[name] = simple(value) if name.isupper() else {}
         elif getattr(value, "__module__", None) == module.__name__:
             found[name] = defaults(value)
+            if dataclasses.is_dataclass(value):
+                made = value.__dataclass_params__  # type: ignore[attr-defined]
+                found[name] |= {"is frozen": made.frozen, "compares": made.eq, "is ordered": made.order}
             for key, each in vars(value).items() if inspect.isclass(value) else ():
                 if key.startswith("__"):
                     continue

@@ -271,6 +271,24 @@ def test_failures_of_connections_are_explained(monkeypatch: pytest.MonkeyPatch, 
     assert {name: given[name] for name in asked} == asked
 
 
+@pytest.mark.parametrize("error", [OSError, RuntimeError, TimeoutError])
+def test_closing_ends_soon_and_without_errors(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Any) -> None:
+    """Closing must neither hang nor hide the error of the run."""
+    import distributed
+
+    limits: list[float] = []
+
+    def close(timeout: float) -> None:
+        limits.append(timeout)
+        raise error
+
+    connection._close(SimpleNamespace(close=close))  # type: ignore[arg-type]
+    monkeypatch.setattr(distributed, "LocalCluster", lambda **options: SimpleNamespace(security="s", close=close))
+    with pytest.raises(ValueError, match="of the run s"), connection._started(1, tmp_path) as (_, security):
+        raise ValueError(f"of the run {security}")
+    assert [0 < limit <= 10 for limit in limits] == [True, True]
+
+
 def test_calls_have_more_time_than_the_longest_one(me: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     limits: list[float] = []
 

@@ -169,3 +169,51 @@ def test_a_state_is_saved_once(tmp_path: Path) -> None:
         made = Pretended(done=3, _saved=saved, folder=folder)
         Recording._save_last_checkpoint(made)  # type: ignore[arg-type]
         assert made.seen == ["_save_checkpoint"] * calls
+
+
+@pytest.mark.parametrize(
+    ("done", "after", "stopped", "raised", "seen", "status", "failure"),
+    [
+        (0, 5, "", None, ["begin", "_begin"], Status.FINISHED, None),
+        (2, 5, "", None, ["begin"], Status.FINISHED, None),
+        (0, 4, "", None, ["begin", "_begin"], Status.INTERRUPTED, None),
+        (0, 4, "no time", None, ["begin", "_begin"], Status.FINISHED, None),
+        (0, 5, "", KeyboardInterrupt(), ["begin", "_begin", "stand"], Status.INTERRUPTED, None),
+        (0, 3, "", ValueError("x"), ["begin", "_begin"], Status.FAILED, "x"),
+        (0, 4, "", GeneratorExit(), ["begin", "_begin"], Status.INTERRUPTED, None),
+    ],
+)  # fmt: skip
+def test_how_a_run_ends(
+    tmp_path: Path,
+    done: int,
+    after: int,
+    stopped: str,
+    raised: BaseException | None,
+    seen: list[str],
+    status: Status,
+    failure: str | None,
+) -> None:
+    """A run of 5 iterations. It is interrupted if some are left, unless a criterion has stopped it."""
+    (tmp_path / "fabrication.json").touch()
+    made = Pretended(done=done, folder=SimpleNamespace(path=tmp_path), _saved=None)
+    made.page = SimpleNamespace(refresh=made.note("refresh"))
+    made.calls = SimpleNamespace(begin=made.note("begin"))
+    made.course = SimpleNamespace(state=SimpleNamespace(stopped=stopped), stand=made.note("stand"))
+    made.problem = SimpleNamespace(config=SimpleNamespace(run=SimpleNamespace(iterations=5)))
+    ended: list[Any] = []
+
+    def iterate() -> Any:
+        assert not (tmp_path / "fabrication.json").exists()
+        yield "record"
+        made.done = after
+        if raised is not None:
+            raise raised
+
+    def end(status: Status, failure: BaseException | None) -> Status:
+        ended.append(failure and str(failure))
+        return status
+
+    made._iterate, made._end = iterate, end
+    assert list(Recording._records(made)) == ["record"]  # type: ignore[arg-type]
+    assert (made.seen, made.status, ended) == (["refresh", *seen], status, [failure])
+    assert made._saved == (done or None)

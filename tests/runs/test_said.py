@@ -18,7 +18,6 @@ from kit import work_in
 from records.test_metrics import make_record
 
 from reslrb_cli.cli import sweep
-from reslrb_cli.errors import ExitCode
 from reslrb_cli.records.manifest import PROGRAM, Status
 from reslrb_cli.runs import loggers, recorder
 from reslrb_cli.runs.callbacks import RunInfo
@@ -77,7 +76,9 @@ def test_a_run_that_is_interrupted_and_continued(folder: Path, monkeypatch: pyte
 
 
 def pretend(ends: dict[str, tuple[int, str]], told: list[Any]) -> Any:
-    """Return a replacement of `jobs.call`. `ends` has the exit code and the line of runs that do not finish."""
+    """Return a replacement of `jobs.call`. `ends` has the exit code and the line of runs. If the line says so, somebody
+    interrupts the sweep.
+    """
 
     def call(arguments: list[str], interrupts: Any, slot: Any = None, fresh: bool = False) -> tuple[int, str]:
         sets = dict(word.partition("=")[::2] for word in arguments if word.startswith("run."))
@@ -96,7 +97,7 @@ def pretend(ends: dict[str, tuple[int, str]], told: list[Any]) -> Any:
         status = Status.FINISHED if code == 0 else Status.FAILED
         content = {"program": PROGRAM, "status": status, "results": results, "error": None if code == 0 else line}
         (run / "manifest.json").write_text(json.dumps(content))
-        interrupts.requested |= code == ExitCode.INTERRUPTED
+        interrupts.requested |= "interrupted" in line
         return code, line
 
     return call
@@ -112,6 +113,8 @@ SEARCH = ("--search", "optuna", "--trials", "3", "--vary", "optimizer.learning_r
         ("sweep", ("--vary", "run.spp=[4, 8]", "--seeds", "2"), {}, ("--seeds", "3")),
         ("sweep with a failure", ("--vary", "run.spp=[4, 8]"), {"spp=8": (5, "loss is nan")}, ()),
         ("sweep that is interrupted", ("--vary", "run.spp=[4, 8, 6]"), {"spp=8": (130, "interrupted")}, ()),
+        ("sweep that is interrupted at an end", ("--vary", "run.spp=[4, 8]"), {"spp=4": (0, "interrupted late")}, ()),
+        ("sweep that is interrupted at a failure", ("--vary", "run.spp=[4, 8]"), {"spp=4": (5, "interrupted")}, ()),
         ("sweep without a backend", (), {"seed": (3, "no libLLVM")}, ()),
         ("sweep on a full disk", ("--vary", "run.max_seconds=[2]"), {"seed": (6, "s/x: the disk is full")}, ()),
         ("search", (*SEARCH, "--seeds", "2"), {}, ("--trials", "4")),
