@@ -323,9 +323,9 @@ def terminal_line(is_terminal: bool) -> list[bytes]:
     """Return what the last line of a program writes."""
     written: list[bytes] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(terminal.os, "isatty", lambda _: is_terminal)
-        patch.setattr(terminal.os, "write", lambda _, text: written.append(text))
-        patch.setattr(terminal.select, "select", lambda *_: ([], [2], []))
+        patch.setattr(terminal.os, "isatty", lambda number: is_terminal and number == 2)
+        patch.setattr(terminal.os, "write", lambda number, text: written.append(text if number == 2 else b""))
+        patch.setattr(terminal.select, "select", lambda read, write, *_: ([], write, []))
         terminal._say("interrupted")
     return written
 

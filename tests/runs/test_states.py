@@ -410,6 +410,10 @@ def test_recovered_values_are_found_from_any_folder(run: Path, monkeypatch: pyte
 def test_any_text_can_be_logged(run: Path) -> None:
     append_log(RunFolder(run), ["a\udcff"])
     assert (run / "run.log").read_text().endswith("a\\udcff\n")
+    (run / "run.log").unlink()
+    append_log(RunFolder(run), [])
+    append_log(RunFolder(run / "gone"), ["b"])
+    assert not (run / "run.log").exists()
 
 
 def test_the_commit_is_that_of_the_configuration(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

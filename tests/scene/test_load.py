@@ -6,6 +6,8 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -19,6 +21,7 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene.catalog import MARGIN, list_parameters
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.parameters import select_parameters
+from reslrb_cli.scene.xml import build
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -484,3 +487,20 @@ def test_a_duplicate_id_is_refused(tmp_path):
     file = write(tmp_path, lit('<shape type="sphere" id="ball"/>\n<shape type="cube" id="ball"/>'))
     with pytest.raises(ConfigError, match=f"{file}:5: id `ball` is also that of {file}:4; rename one of them"):
         load_scene(file)
+
+
+def test_unused_children_are_told_by_their_numbers() -> None:
+    """Mitsuba numbers children without a name. A number beyond them is the name of a parameter."""
+    children = [SimpleNamespace(name=name, tag=tag, is_object=tag != "ref", written=name)
+                for name, tag in (("", "bsdf"), ("a", "bsdf"), ("", "ref"), ("", "float"))]  # fmt: skip
+    children[3].is_object = False
+    element: Any = SimpleNamespace(
+        type="sphere", children=children, written="", find=lambda name: children[1] if name == "a" else None
+    )
+    props: Any = SimpleNamespace(unqueried=lambda: ["_arg_0", "_arg_1", "_arg_2", "a"])
+    notes = build._unused(props, element)
+    assert [note.element for note in notes] == [children[0], children[2], element, children[1]]
+    assert [note.wrong.partition(" in Mitsuba 3")[0] for note in notes] == [
+        "sphere does not use a <bsdf>", "sphere does not use a <ref>", "sphere has no parameter `_arg_2`",
+        "sphere has no parameter `a`",
+    ]  # fmt: skip
