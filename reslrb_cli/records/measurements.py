@@ -349,6 +349,8 @@ REDUCED = 2
 
 #: Verdict on a parameter with an incomplete derivative.
 INCOMPLETE = "derivative incomplete"
+#: Verdict on a value that is settled, unless the misfit of the model has moved it.
+MISFIT = "settled, but the model does not explain the picture"
 
 
 def student(seeds: int, directions: int) -> float:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.records.manifest import Status
-from reslrb_cli.records.measurements import INCOMPLETE, incomplete_records
+from reslrb_cli.records.measurements import INCOMPLETE, MISFIT, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
 
@@ -42,8 +42,11 @@ LONGER = "more iterations"
 #: The proposal to render the target with more samples.
 CLEANER, UNBIASED = "a cleaner target", "a loss without bias"
 
+#: The proposal to recover a parameter that would explain the misfit of the model.
+RECOVER = "another parameter"
+
 #: Proposals in the order of priority: the first ones make the later ones useless.
-ORDER = ("a limit", "a lower rate", "a higher rate", "a new run from here", LONGER, UNBIASED, CLEANER)
+ORDER = ("a limit", "a lower rate", RECOVER, "a higher rate", "a new run from here", LONGER, UNBIASED, CLEANER)
 
 #: Maximum number of parameters named for one verdict.
 MOST_NAMED = 3
@@ -177,6 +180,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         return Remedy(UNBIASED, "--set loss.type=l2")
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return _samples(MORE_SAMPLES * measured["target_spp"])
+    if about.get("verdict") == MISFIT and (named := candidates_of(results)):
+        return Remedy(RECOVER, spec_of(named[0]))
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
     if about.get("verdict") != MOVING or moved is None or not iterations:
         return None
@@ -223,6 +228,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
         shares = [record.percent() for record in incomplete_records(results.get("incomplete") or ())
                   if record.parameter in keys and verdict == INCOMPLETE]  # fmt: skip
         line += f" ({', '.join(shares)} of it is missing)" if shares else ""
+        line += f" ({misfit_words(results)})" if verdict == MISFIT else ""
         own = {remedy.words for key in keys if (remedy := find_remedy(results, key)) is not None}
         line += f" ({best.words}: {best.setting})" if best is not None and best.words in own else ""
         lines.append(line)
@@ -236,6 +242,43 @@ def noise_line(results: Mapping[str, Any]) -> str:
         return ""
     which = "" if measured["target_noise"] == "left out" else " that are files"
     return f"spread: by the noise of the run; noise and errors of targets{which} are not in it"
+
+
+def misfit_words(results: Mapping[str, Any]) -> str:
+    """Return the size of the difference between the images and their targets that noise does not explain. The result is
+    empty if noise explains the difference.
+    """
+    fit = (results.get("certainty") or {}).get("fit") or {}
+    if not fit.get("is_significant"):
+        return ""
+    return f"images and targets differ by {100 * fit['misfit']:.2g} % more than by noise"
+
+
+def candidates_of(results: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the parameters that would reduce the misfit, as recorded (`candidates.Candidate`)."""
+    return list(((results.get("certainty") or {}).get("fit") or {}).get("candidates") or ())
+
+
+def spec_of(candidate: Mapping[str, Any]) -> str:
+    """Return the entry of `parameters` that recovers a candidate."""
+    bounds = f", bounds: {candidate['bounds']}" if candidate.get("bounds") else ""
+    return f"- {{key: {candidate['key']}{bounds}}}"
+
+
+def misfit_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return lines about a model that does not fit the targets, and entries of `parameters` that would reduce the
+    misfit. The result is empty if the model fits.
+    """
+    words = misfit_words(results)
+    if not words:
+        return []
+    lines = [f"misfit: {words}; the spreads include as large a misfit that the values may hide"]
+    found = candidates_of(results)
+    lines += ["these entries of `parameters` would reduce it:"] if found else []
+    for each in found:
+        old, new = (" ".join(number(value, 3) for value in each[name]) for name in ("value", "proposed"))
+        lines.append(f"  {spec_of(each)}  # {100 * each['explained']:.2g} % of the misfit; {old} would become {new}")
+    return lines
 
 
 def _source(results: Mapping[str, Any]) -> str:
@@ -437,7 +480,7 @@ def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
     lines = _table(listed, titles, rows, width) or _blocks(listed, titles, rows, width)
     if len(shown) > len(listed):
         lines.append(shorten(f"and {count(len(shown) - len(listed), 'more parameter')}, on the page", width))
-    return [*lines, *wrap(noise_line(results), width)]
+    return [*lines, *wrap(noise_line(results), width), *misfit_lines(results)]
 
 
 def units_differ(results: Mapping[str, Any]) -> bool:

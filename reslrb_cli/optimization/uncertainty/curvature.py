@@ -50,6 +50,7 @@ from reslrb_cli.optimization.uncertainty.noise import (
     second_derivative,
     target_noises,
 )
+from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array, scale_frequencies
 
@@ -62,6 +63,8 @@ NEIGHBOURS, LEAST_EIGENVALUE = 2, 0.05
 MARGIN = 1.0
 #: Maximum number of image values in H along directions; of more, a random subset, the same for all.
 MOST_VALUES = 2**18
+#: Smallest eigenvalue of the curvature along which a Newton step is made, as a share of the largest.
+LEAST_STEP = 1e-3
 #: Samples for probes of large parameters, and the number of the sample of products.
 PROBED, FIRST_PRODUCT = 2, 1000
 
@@ -234,7 +237,8 @@ class LossCurvature:
         values = sum(weight.size for weight in self._weights)
         random = np.random.default_rng(self._seed(0, 0))
         self._picked = None if values <= MOST_VALUES else np.sort(random.choice(values, MOST_VALUES, replace=False))
-        self._thinned = max(values / MOST_VALUES, 1.0)
+        #: Number of values of the images for each value that is used.
+        self.thinned = max(values / MOST_VALUES, 1.0)
         #: Share (M,) of the curvature along each direction that remains without its standard error.
         self.sure = np.zeros(0)
         #: Derivatives (M, N) of all pixels along each direction, by each set of samples. The first set has the weights.
@@ -272,7 +276,7 @@ class LossCurvature:
                 bias.append(0.0)
                 for half in (0, 1):
                     slopes = [_of_channel(each, direction.channel) for each in derivatives[half]]
-                    columns[half].append(self._in_a_row(slopes))
+                    columns[half].append(self.in_a_row(slopes))
                     if self.biases:
                         views = zip(slopes, self.biases[half], strict=True)
                         bias[-1] += 0.5 * sum(float(np.sum(each * effect)) for each, effect in views)
@@ -284,7 +288,7 @@ class LossCurvature:
         if not directions:
             return [], np.zeros((0, 0)), np.zeros((0, 0))
         a, b = (np.array(rows) for rows in columns)
-        a = a * self._in_a_row(self._weights) * self._thinned
+        a = a * self.weights
         self.slopes = a, b
         self.sure = _sure_share(a * b)
         sure = np.sqrt(np.outer(self.sure, self.sure))
@@ -403,7 +407,29 @@ class LossCurvature:
         a, b = (self._probe(gradients, number + half) for half, gradients in enumerate((one, other)))
         return {key: (a[key].astype(np.float64), b[key].astype(np.float64)) for key in a}
 
-    def _in_a_row(self, images: Sequence[Array]) -> Array:
+    @property
+    def weights(self) -> Array:
+        """The weights (N,) in the first set of `slopes`."""
+        return self.in_a_row(self._weights) * self.thinned
+
+    def removed(self, slopes: Sequence[Array]) -> list[Array]:
+        """Return the change of each view's image (H, W, C) that a Newton step along the measured directions would
+        remove. `slopes` are dL/dI. Values that are not used are 0.
+        """
+        a, b = self.slopes
+        weights = self.weights
+        change = np.zeros(len(weights))
+        if len(a):
+            J = 0.5 * (a / np.where(weights > 0, weights, np.inf) + b)
+            inverse = np.linalg.pinv(positive(a @ b.T), rcond=LEAST_STEP, hermitian=True)
+            change = (inverse @ (J @ (self.thinned * self.in_a_row(slopes)))) @ J
+        flat = np.zeros(sum(image.size for image in slopes))
+        flat[slice(None) if self._picked is None else self._picked] = change
+        parts = np.split(flat, np.cumsum([image.size for image in slopes])[:-1])
+        return [part.reshape(image.shape) for part, image in zip(parts, slopes, strict=True)]
+
+    def in_a_row(self, images: Sequence[Array]) -> Array:
+        """Return the used values (N,) of images of all views (H, W, C)."""
         row = np.concatenate([image.ravel() for image in images])
         return row if self._picked is None else row[self._picked]
 

@@ -15,6 +15,7 @@ from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
+from reslrb_cli.optimization.uncertainty.candidates import judge_fit
 from reslrb_cli.optimization.uncertainty.coupling import Maps, followed, measure_maps, with_followed
 from reslrb_cli.optimization.uncertainty.curvature import (
     EntryCurvature,
@@ -24,8 +25,15 @@ from reslrb_cli.optimization.uncertainty.curvature import (
     plan_changes,
     row_of,
 )
+from reslrb_cli.optimization.uncertainty.fit import measure_fit
 from reslrb_cli.optimization.uncertainty.posterior import Measured
-from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, Gradients, ParameterCertainty, weigh
+from reslrb_cli.optimization.uncertainty.verdicts import (
+    CertaintyRecord,
+    Gradients,
+    ParameterCertainty,
+    weigh,
+    with_misfit,
+)
 from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.tree import to_array
 from reslrb_cli.scene.dispersion import bends_light
@@ -59,6 +67,8 @@ MOST_ENTRIES = 64
 #: Curvature that takes longer than this share of the run's iterations, this many of them, and this many seconds is left
 #: out.
 SHARE, MOST_STEPS, LEAST_SECONDS = 0.25, 50, 20.0
+#: Time for the test of fit: a share of the run's iterations, and at least this many seconds.
+SHARE_OF_FIT, LEAST_SECONDS_OF_FIT = 0.1, 10.0
 
 
 class Certainty:
@@ -128,7 +138,13 @@ class Certainty:
             compiled_ms += times.codegen_ms
             if stop():
                 return None
-            weighed = weigh(measured, found.directions, found.H, found.B, found.by_entry, found.alone, found.maps)
+            weighed = found.weighed(measured)
+            go_on = _Budget(max(SHARE_OF_FIT * elapsed_s, LEAST_SECONDS_OF_FIT), stop)
+            with clock.step() as times:
+                fit = judge_fit(problem, measure_fit(problem, found.first), found.first, go_on)
+            compiled_ms += times.codegen_ms
+            if fit.is_significant:
+                weighed = with_misfit(weighed, found.with_misfit(fit.energy).weighed(measured))
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
             render = config.target.render
             return CertaintyRecord(
@@ -140,6 +156,7 @@ class Certainty:
                 target_noise=self._target_noise(),
                 target_spp=None if render is None else render.spp,
                 is_biased=found.is_biased,
+                fit=fit,
             )
         finally:
             take_gradient(problem)
@@ -235,7 +252,7 @@ class Certainty:
 class Curvatures:
     """Measured curvature at the final values: H and B (M, M) along `directions`, and `alone` (M,) along each direction
     if no texture follows; the curvature of each entry of large parameters; and the maps of one shape. `is_biased` is
-    true if noise of the images biases the gradients of the loss.
+    true if noise of the images biases the gradients of the loss. `first` is the first measurement along all directions.
     """
 
     directions: list[ParameterDirection]
@@ -245,6 +262,21 @@ class Curvatures:
     by_entry: dict[str, EntryCurvature]
     maps: list[Maps]
     is_biased: bool
+    first: LossCurvature
+
+    def weighed(self, measured: Mapping[str, Measured]) -> dict[str, ParameterCertainty]:
+        """Return the certainty of each parameter."""
+        return weigh(measured, self.directions, self.H, self.B, self.by_entry, self.alone, self.maps)
+
+    def with_misfit(self, energy: float) -> Curvatures:
+        """Return the curvatures with a misfit of this energy (`fit.py`) in B and in its diagonal by entry. The offset
+        of each direction, and that of all entries of a texture together, may have made up for a misfit of this size.
+        """
+        by_entry = {}
+        for key, own in self.by_entry.items():
+            added = energy * np.maximum(own.diagonal, 0.0) / max(int(np.count_nonzero(own.diagonal)), 1)
+            by_entry[key] = replace(own, of_target=added if own.of_target is None else own.of_target + added)
+        return replace(self, B=self.B + energy * self.H, by_entry=by_entry)
 
 
 def _measure_curvature(
@@ -289,6 +321,7 @@ def _measure_curvature(
         by_entry={key: entries for key, entries in by_entry.items() if key not in unknown},
         maps=maps,
         is_biased=bool(curvature.biases),
+        first=curvature,
     )
 
 

@@ -28,6 +28,9 @@ move together.
 If the derivative of a parameter lacks a significant share, or if this share is unknown, its verdict is `derivative
 incomplete`. A run measures the missing share before its first iteration (`measure/missing.py`).
 
+If the model does not fit the targets (`fit.py`), spreads include the offset that the misfit may have caused. A
+`settled` parameter that is not settled with these spreads gets the verdict `MISFIT`.
+
 A small parameter is `settled` if at least `SETTLED_SHARE` of its entries with an effect are settled. The entries of a
 large parameter are judged in groups. If the limit of their root mean square is at most tau, all of them are settled.
 Otherwise, the parameter gets the most frequent verdict of the unsettled visible entries with an effect.
@@ -42,6 +45,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reslrb_cli.optimization.optimizers import SMALL
+from reslrb_cli.optimization.uncertainty.candidates import FitRecord
 from reslrb_cli.optimization.uncertainty.coupling import Maps, texel_offsets
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.posterior import (
@@ -55,7 +59,7 @@ from reslrb_cli.optimization.uncertainty.posterior import (
     spread_of,
 )
 from reslrb_cli.records.decisions import Jsonable
-from reslrb_cli.records.measurements import INCOMPLETE
+from reslrb_cli.records.measurements import INCOMPLETE, MISFIT
 from reslrb_cli.statistics import Array, rms
 
 #: Remaining share of a value's spread, given the others, below which they compensate for it.
@@ -83,6 +87,7 @@ class ParameterVerdict(str, enum.Enum):
     EFFECT_LOST = "effect lost"
     NOT_SEEN = "not seen"
     INCOMPLETE = INCOMPLETE
+    MISFIT = MISFIT
     SETTLED = "settled"
 
 
@@ -169,7 +174,8 @@ class CertaintyRecord(Jsonable):
     run's iterations. `iterations`, `learning_rate` and `target_spp` repeat the run's settings.
     `learning_rate` is that of `optimizer`. `target_noise` is `measured` if all targets were rendered, `in part` if some
     were, otherwise `left out`. The spreads include only the noise of rendered targets. `is_biased` is true if noise of
-    the images biases the gradients of the loss. The spreads, and the parts `of_target`, then include the bias.
+    the images biases the gradients of the loss. The spreads, and the parts `of_target`, then include the bias. `fit`
+    states whether the model fits the targets.
     """
 
     parameters: dict[str, ParameterCertainty]
@@ -180,6 +186,7 @@ class CertaintyRecord(Jsonable):
     target_noise: str
     target_spp: int | None = None
     is_biased: bool = False
+    fit: FitRecord | None = None
 
     def without_derivatives(self, keys: Collection[str]) -> CertaintyRecord:
         """Return the record with the verdict `derivative incomplete` for the parameters `keys`."""
@@ -300,6 +307,21 @@ def weigh(
         about = result[direction.key]
         if about.verdict == ParameterVerdict.SETTLED.value and found.partners[place] in moving - {direction.key}:
             result[direction.key] = replace(about, verdict=ParameterVerdict.STILL_MOVING.value)
+    return result
+
+
+def with_misfit(found: Mapping[str, ParameterCertainty], wider: Mapping[str, ParameterCertainty]
+                ) -> dict[str, ParameterCertainty]:  # fmt: skip
+    """Return the certainty with the spreads of `wider`, which include the misfit of the model. Settled parameters that
+    are not settled in `wider` get the verdict `MISFIT`.
+    """
+    settled, misfit, result = ParameterVerdict.SETTLED.value, ParameterVerdict.MISFIT.value, {}
+    for key, about in found.items():
+        about = replace(about, spread=wider[key].spread)
+        if about.verdict == settled and wider[key].verdict != settled:
+            shares = {misfit if name == settled else name: share for name, share in about.shares.items()}
+            about = replace(about, verdict=misfit, shares=shares)
+        result[key] = about
     return result
 
 

@@ -1,0 +1,234 @@
+"""Parameters that the run does not recover, and that would reduce the misfit of the model (Rao's score test).
+
+For the change of an image j along a direction of such a parameter, by differences of images at common random numbers,
+and dL/dI at the final values, the loss has the derivative s = sum over pixels of j dL/dI. The recovered parameters
+would follow: the part of j that they can cause is subtracted, with H between both. If the parameter was recovered too,
+the loss would fall by about s^2 / (2 h), where h is the curvature that remains. The directions of a parameter are taken
+together.
+
+The noise of s follows from the noise of the residual (`fit.Residual`). Directions that change all channels have the
+noise of channels that are fully correlated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import yaml
+
+from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.optimization.problem import Problem, make_optimizer
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
+from reslrb_cli.optimization.uncertainty.fit import Fit
+from reslrb_cli.optimization.uncertainty.posterior import positive
+from reslrb_cli.records.decisions import Jsonable
+from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.parameters import select_parameters
+from reslrb_cli.scene.proposal import Proposal, propose
+from reslrb_cli.statistics import Array, rms, special
+
+#: Step of the differences, as a share of a parameter's scale.
+STEP = 0.05
+#: Largest `p` of residuals, or of a parameter, with which the model does not fit. Largest `p` of parameters that are
+#: then named.
+LEVEL, LEVEL_OF_NAMED = 0.004, 0.01
+#: Smallest explained share of a parameter that is named.
+LEAST_EXPLAINED = 0.1
+#: Smallest eigenvalue of a curvature that counts, as a share of its largest.
+LEAST_EIGENVALUE = 1e-3
+#: Number of parameters that are measured with `MORE` times the samples, up to a multiple of a step's, as long as noise
+#: leaves less than the share `LEAST_SURE` of their curvature.
+MOST_MEASURED_AGAIN, MORE, MOST_MULTIPLE, LEAST_SURE = 5, 4, 16, 0.8
+#: Maximum number of recorded parameters.
+MOST_RECORDED = 5
+
+
+@dataclass(frozen=True)
+class FitRecord(Jsonable):
+    """Whether the model fits the targets. `p` is the probability that noise looks like the residuals or, if it is
+    smaller, like the effect of any of the tested parameters. `misfit` is the root mean square of the misfit over the
+    images, as a share of the target's. `energy` is twice the loss of the misfit. `candidates` are parameters that would
+    reduce the misfit, the most effective one first.
+    """
+
+    p: float
+    misfit: float
+    energy: float
+    is_significant: bool
+    candidates: list[Candidate]
+
+
+@dataclass(frozen=True)
+class Candidate(Jsonable):
+    """A parameter that would reduce the misfit: `explained` is the share of the misfit's loss, at most 1. `value` is
+    the present value, and `proposed` the value to which the test points; a texture has one factor for each channel.
+    `p` is the probability that noise shows any of the tested parameters like this one. `bounds` are YAML, or "".
+    """
+
+    key: str
+    p: float
+    explained: float
+    value: list[float]
+    proposed: list[float]
+    bounds: str = ""
+
+
+def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]) -> FitRecord:
+    """Return the record of a test of fit, with the parameters that would reduce a misfit significantly.
+
+    `known` has measured the recovered directions. The test of further parameters ends when `go_on` returns false.
+    """
+    found = _find_candidates(problem, fit, known, go_on)
+    p = min([fit.p, *(own for _, own, _ in found)])
+    is_significant = p <= LEVEL
+    named = [each for each in found if is_significant and each[1] <= LEVEL_OF_NAMED]
+    energy = max(fit.energy, *(2 * fall for fall, *_ in named), 0.0)
+    candidates = [replace(each, explained=min(2 * fall / max(energy, 1e-300), 1.0)) for fall, _, each in named]
+    kept = [each for each in candidates if each.explained >= LEAST_EXPLAINED][:MOST_RECORDED]
+    misfit = (energy / max(fit.size, 1e-300)) ** 0.5
+    return FitRecord(p, misfit, energy, is_significant, kept)
+
+
+def _find_candidates(
+    problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
+) -> list[tuple[float, float, Candidate]]:
+    """Return the further parameters, each after the fall of the loss and its `p`, in the order of the falls."""
+    proposals = {each.info.key: each for each in _unrecovered(problem)}
+    specs = [ParameterSpec(key=key, bounds=None if each.bounds is None else yaml.safe_load(each.bounds))
+             for key, each in proposals.items()]  # fmt: skip
+    if not specs:
+        return []
+    selection = select_parameters(problem.scene, specs, problem.config.source)
+    others = replace(problem, selection=selection, optimizer=make_optimizer(problem.config, selection), regularizers={})
+    before = others.values()
+    scales = {key: scale_of(others, proposals[key]) for key in selection.keys}
+    changes, most = plan_changes(others, scales, STEP), MOST_MULTIPLE * problem.config.run.spp
+    found: list[tuple[float, float, Candidate]] = []
+    try:
+        count, round, spp = 0, 0, known.spp
+        while changes and go_on():
+            curvature = LossCurvature(others, spp, of_target=False, round=round)
+            directions, *_ = curvature.along(changes, go_on)
+            count = count or len({direction.key for direction in directions})
+            if len(directions) < sum(len(change.directions) for change in changes) and found:
+                break  # the time is up, and the earlier measurement is complete
+            found = _test(others, fit, known.slopes, curvature, directions, proposals, count)
+            # More samples decide on the parameters with the largest effects.
+            named = {each.key for _, _, each in found[:MOST_MEASURED_AGAIN]}
+            sure = {each.key: share for each, share in zip(directions, curvature.sure, strict=True)}
+            if spp >= most or all(sure[key] >= LEAST_SURE for key in named):
+                break
+            spp, round = min(spp * MORE, most), round + 1
+            changes = [change for change in changes if named & set(change.values)]
+    finally:
+        selection.set_arrays(before)
+    return found
+
+
+def _test(
+    problem: Problem,
+    fit: Fit,
+    known: tuple[Array, Array],
+    curvature: LossCurvature,
+    directions: Sequence[ParameterDirection],
+    proposals: Mapping[str, Proposal],
+    count: int,
+) -> list[tuple[float, float, Candidate]]:
+    """Return the tested parameters, each after the fall of the loss and its `p`, in the order of the falls. `count` is
+    the number of parameters that were tested at first.
+    """
+    if not directions:
+        return []
+    slope = curvature.thinned * curvature.in_a_row([each.slope for each in fit.residuals])
+    variance = curvature.thinned**2 * curvature.in_a_row([each.variance for each in fit.residuals])
+    all_channels = fit.residuals[0].slope.shape[2]
+    channels = np.array([1.0 if each.channel is not None else all_channels for each in directions])
+    tests = _Tests(known, curvature.slopes, curvature.weights, slope, variance, channels)
+    found = []
+    for key in dict.fromkeys(direction.key for direction in directions):
+        places = [place for place, direction in enumerate(directions) if direction.key == key]
+        fall, p, offset = tests.of(places)
+        p = min(p * count, 1.0)
+        own = [directions[each] for each in places]
+        found.append((fall, p, _candidate(problem, proposals[key], own, offset, p)))
+    return sorted(found, key=lambda each: -each[0])
+
+
+def _unrecovered(problem: Problem) -> list[Proposal]:
+    """Return the parameters that could be recovered too, the most visible ones first."""
+    taken = {*problem.selection.scene_keys}
+    found = []
+    for each in propose(problem.scene, problem.trained[0].sensor):
+        is_texture = len(each.info.shape) == 3
+        is_large = not is_texture and int(np.prod(each.info.shape)) > 4
+        if each.info.key not in taken and each.info.bits is None and not is_large:
+            found.append(each)
+    params = problem.selection.params
+    moved = {item.key for item in where_moved(params, [each.info.key for each in found])}
+    return [each for each in found if each.info.key not in moved]
+
+
+def scale_of(problem: Problem, proposal: Proposal) -> float:
+    """Return the scale of a parameter: its value, or half the distance between its bounds, if that is larger."""
+    key = proposal.info.key
+    sizes = [rms(problem.selection.array(key))]
+    low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
+    if np.isfinite(high - low):
+        sizes.append(0.5 * (high - low))
+    return max(sizes) or 1.0
+
+
+def _candidate(
+    problem: Problem, proposal: Proposal, directions: Sequence[ParameterDirection], offset: Array, p: float
+) -> Candidate:
+    key = proposal.info.key
+    value = problem.selection.array(key).astype(np.float64).ravel()
+    if directions[0].entry is None:
+        value, proposed = np.ones(len(directions)), 1 + offset
+    else:
+        proposed = value.copy()
+        proposed[[direction.entry for direction in directions]] += offset
+    low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
+    shown = np.clip(proposed, low, high) if directions[0].entry is not None else np.maximum(proposed, 0.0)
+    return Candidate(key, p, 0.0, [float(x) for x in value], [float(x) for x in shown], proposal.bounds or "")
+
+
+class _Tests:
+    """Score tests of directions. `known` and `new` are the derivatives of N values of the images along directions, by
+    two sets of samples. The first sets have the weights (N,). `slope` and `variance` (N,) are dL/dI and its noise.
+    `channels` (M,) is the number of channels that each new direction changes.
+    """
+
+    def __init__(
+        self,
+        known: tuple[Array, Array],
+        new: tuple[Array, Array],
+        weights: Array,
+        slope: Array,
+        variance: Array,
+        channels: Array,
+    ) -> None:
+        inverse = np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), 0.0)
+        halves, self.H = [new[0] * inverse, new[1]], new[0] @ new[1].T
+        if len(known[0]):
+            between = 0.5 * (new[0] @ known[1].T + new[1] @ known[0].T)
+            followed = between @ np.linalg.pinv(positive(known[0] @ known[1].T), rcond=LEAST_EIGENVALUE, hermitian=True)
+            others = followed @ (0.5 * (known[0] * inverse + known[1]))
+            halves = [half - others for half in halves]
+            self.H = self.H - followed @ between.T
+        self.H = positive(self.H)
+        s = [half @ slope for half in halves]
+        self.s = 0.5 * (s[0] + s[1])
+        # Noise of the derivatives of images shows in the difference of both sets.
+        of_residual = positive((halves[0] * variance) @ halves[1].T * np.sqrt(np.outer(channels, channels)))
+        self.V = of_residual + np.diag(0.25 * (s[0] - s[1]) ** 2)
+
+    def of(self, places: Sequence[int]) -> tuple[float, float, Array]:
+        """Return the fall of the loss, the probability that noise causes it, and the offsets of the directions."""
+        s, at = self.s[places], np.ix_(places, places)
+        inverse = np.linalg.pinv(self.H[at], rcond=LEAST_EIGENVALUE, hermitian=True)
+        z2 = float(s @ np.linalg.pinv(self.V[at], rcond=1e-9, hermitian=True) @ s)
+        p = float(special().chdtrc(len(places), z2))
+        return 0.5 * float(s @ inverse @ s), p, np.asarray(-inverse @ s)

@@ -1,0 +1,166 @@
+"""Test of fit: false alarms and power for noise of several kinds, the score test of further parameters, and whole runs
+of a model that is right or wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import yaml
+from optimization.families import CORNER, SURFACES
+from optimization.judged import iterate_to_the_end
+from scipy.ndimage import gaussian_filter
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.uncertainty import candidates, fit
+from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
+from reslrb_cli.records.measurements import MISFIT
+
+Random = np.random.Generator
+NOISE: dict[str, Callable[[Random, tuple[int, ...]], np.ndarray]] = {
+    "normal": lambda random, shape: random.normal(size=shape),
+    "heavy": lambda random, shape: random.standard_t(3, size=shape),
+    "skewed": lambda random, shape: random.lognormal(0, 1, size=shape) - np.exp(0.5),
+    "colours": lambda random, shape: random.normal(size=(*shape[:2], 1)) * np.array([1, 0.8, 0.5]),
+    "bright": lambda random, shape: random.normal(size=shape) * np.geomspace(0.01, 1, shape[1])[:, None],
+}
+#: Simulated images or models of each kind.
+IMAGES = 80
+
+
+@pytest.mark.parametrize("kind", NOISE)
+def test_noise_is_no_misfit(kind: str):
+    random = np.random.default_rng(1)
+    found = [fit.compare(fit.cells_of(NOISE[kind](random, (12, 16, 3)), 1), random).p for _ in range(IMAGES)]
+    assert np.sum(np.array(found) <= candidates.LEVEL) <= 3  # 0.3 are expected
+    assert np.sum(np.array(found) <= 0.1) <= 16  # 8 are expected
+    assert 0.35 < np.mean(found) < 0.65
+
+
+@pytest.mark.parametrize("kind", ["normal", "heavy"])
+def test_a_constant_misfit_is_found(kind: str):
+    """A misfit as large as the noise in a ninth of the image is found, and its energy is measured."""
+    random, found = np.random.default_rng(2), []
+    for _ in range(20):
+        noise = NOISE[kind](random, (24, 24, 3))
+        noise[:8, 8:16] += noise.std()
+        found.append(fit.compare(fit.cells_of(noise, 1), random))
+    assert np.mean([each.p <= candidates.LEVEL for each in found]) >= 0.9
+    noise = 0.1 * random.normal(size=(24, 24, 3))
+    noise[:8, 8:16] += 0.5
+    assert fit.compare(fit.cells_of(noise, 1), random).energy == pytest.approx(8 * 8 * 3 * 0.25, rel=0.1)
+
+
+def test_the_filter_of_the_film_correlates_no_cells(llvm):
+    """Noise of a Gaussian filter is a misfit for cells of a pixel, and none for the lattice that the filter needs."""
+    own = fit.correlations(mi.load_dict({"type": "gaussian"}))
+    lattice = 1 + int(np.max(np.nonzero(own >= fit.UNCORRELATED)[0]))
+    random = np.random.default_rng(3)
+    alarms = {1: 0, lattice: 0}
+    for _ in range(20):
+        noise = gaussian_filter(random.normal(size=(36, 36, 3)), 0.5, axes=(0, 1))
+        for side in alarms:
+            alarms[side] += fit.compare(fit.cells_of(noise, side), random).p <= candidates.LEVEL
+    assert alarms[1] == 20
+    assert alarms[lattice] <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "right"), [("box", [1.0]), ("gaussian", [1.0, np.exp(-1), np.exp(-4)]), ("tent", [1.0, 0.25])]
+)
+def test_correlations_of_filters(name: str, right: list[float], llvm):
+    found = fit.correlations(mi.load_dict({"type": name}))
+    np.testing.assert_allclose(found[: len(right)], right, atol=0.01)
+    assert np.all(found[len(right) :] < 0.01)
+
+
+def test_large_images_have_few_cells():
+    assert fit.cells_of(np.ones((300, 500, 3)), 3).shape == (34, 56, 27)
+    assert fit.compare(np.ones((1, 1, 3)), np.random.default_rng(0)).p == 1.0
+
+
+def linear(random: Random, known: int, planted: float) -> tuple[candidates._Tests, np.ndarray]:
+    """Return the tests of two further parameters of a linear model after its `known` parameters were recovered. The
+    first one is wrong by `planted`. Return also the derivatives of its images.
+    """
+    size = 600
+    J = random.normal(size=(known + 2, size))
+    J[known] += 0.5 * J[0]  # a recovered parameter makes up for a part
+    weights, noise = np.full(size, 2.0), 0.3
+    residual = planted * J[known] + noise * random.normal(size=size)
+    residual = residual - J[:known].T @ np.linalg.lstsq(J[:known].T, residual, rcond=None)[0]
+    halves = [J + 0.05 * random.normal(size=J.shape) for _ in range(2)]
+    a, b = halves[0] * weights, halves[1]
+    variance = weights**2 * noise**2
+    tests = candidates._Tests(
+        (a[:known], b[:known]), (a[known:], b[known:]), weights, weights * residual, variance, np.ones(2)
+    )
+    return tests, J
+
+
+@pytest.mark.parametrize("known", [0, 3])
+def test_the_wrong_parameter_is_found(known: int):
+    """The offset and the fall of the loss are those of a fit of all parameters."""
+    tests, J = linear(np.random.default_rng(4), known, 0.2)
+    fall, p, offset = tests.of([0])
+    assert p < 1e-6
+    assert offset[0] == pytest.approx(-0.2, rel=0.15)
+    others = J[:known]
+    left = J[known] - (others.T @ np.linalg.lstsq(others.T, J[known], rcond=None)[0] if known else 0)
+    assert fall == pytest.approx(0.5 * 2 * 0.2**2 * left @ left, rel=0.3)
+    assert tests.of([1])[1] > 1e-3
+
+
+def test_noise_shows_no_further_parameter():
+    found = [linear(np.random.default_rng([5, number]), 3, 0.0)[0].of([0])[1] for number in range(IMAGES)]
+    assert 0.35 < np.mean(found) < 0.65
+    assert np.sum(np.array(found) < 0.01) <= 7  # 2 are expected
+
+
+def recovered(folder: Path, right: str, wrong: str, parameters: list[str], **settings: str) -> CertaintyRecord:
+    """Recover `parameters` of the corner whose picture has the text `right` where the model has `wrong`."""
+    config = {
+        "variant": "llvm_ad_rgb", "scene": {"file": "scene.xml"}, "target": {"render": {"spp": 1024}},
+        "integrator": {"type": "reslrb", "max_depth": 3}, "optimizer": {"type": "auto"},
+        "parameters": [{"key": key, "initial": 0.4, "bounds": [0, 1]} for key in parameters],
+        "run": {"iterations": 30, "spp": 16} | settings,
+    }  # fmt: skip
+    assert wrong in CORNER
+    (folder / "scene.xml").write_text(CORNER.replace(wrong, right))
+    (folder / "true.yaml").write_text(yaml.safe_dump(config))
+    target = assemble(load(folder / "true.yaml")).trained[0].target
+    mi.Bitmap(target).write(str(folder / "target.exr"))
+    (folder / "scene.xml").write_text(CORNER)
+    (folder / "run.yaml").write_text(yaml.safe_dump(config | {"target": {"file": "target.exr"}}))
+    problem = assemble(load(folder / "run.yaml"), to_run=True)
+    before = {key: np.array(value) for key, value in mi.traverse(problem.scene) if "alpha" in key}
+    certainty, last = iterate_to_the_end(problem)
+    found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
+    assert found is not None
+    after = {key: np.array(value) for key, value in mi.traverse(problem.scene) if "alpha" in key}
+    assert before
+    assert before == after  # the tests of further parameters change none of them
+    return found
+
+
+ALPHA = 'name="alpha" value="0.2"'
+
+
+def test_a_wrong_roughness_is_named(tmp_path, llvm):
+    found = recovered(tmp_path, ALPHA.replace("0.2", "0.5"), ALPHA, SURFACES[:1])
+    assert found.parameters[SURFACES[0]].verdict == MISFIT
+    assert found.fit is not None
+    first = found.fit.candidates[0]
+    assert first.key == "ball.bsdf.alpha"
+    assert first.value == pytest.approx([0.2])
+    assert 0.35 < first.proposed[0] < 0.75
+    right = recovered(tmp_path, ALPHA, ALPHA, SURFACES[:1])
+    assert right.parameters[SURFACES[0]].verdict == "settled"
+    assert right.fit is not None
+    assert not right.fit.is_significant
+    assert not right.fit.candidates
