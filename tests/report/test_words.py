@@ -6,11 +6,13 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 
 from reslrb_cli.config.files import duration
 from reslrb_cli.errors import printable
+from reslrb_cli.records.measurements import MISFIT
 from reslrb_cli.report.format import count, interval, number, rounded, shorten, with_error
-from reslrb_cli.report.run_summary import last_line, parameter_lines, warnings
+from reslrb_cli.report.run_summary import advice, last_line, parameter_lines, warnings
 
 # Numbers, times, keys and results in words.
 
@@ -233,3 +235,35 @@ def test_invisible_parts_are_reported_beside_settled_ones():
     found = judged({"verdict": "not seen", "shares": {"not seen": 1.0}, "spread": None})
     assert parameter_lines(found, 120)[1].endswith("not seen")
     assert warnings(found) == ["not seen: lamp.radiance.value"]
+
+
+BALL = {"key": "ball.alpha", "p": 1e-9, "explained": 0.98, "value": [0.2], "proposed": [0.4912], "bounds": "[0.02, 1]"}
+TINT = {"key": "rug.data", "p": 1e-5, "explained": 0.31, "value": [1, 1, 1], "proposed": [1.2, 1, 0.9], "bounds": ""}
+FIT = {"p": 0.002, "misfit": 0.0614, "energy": 1e-4, "is_significant": True, "candidates": [BALL, TINT]}
+
+
+def test_a_model_that_does_not_fit_names_what_would():
+    """The entries of `parameters` can be copied. The values that the misfit may have moved are not settled."""
+    found = judged({"verdict": MISFIT, "shares": {MISFIT: 1.0}}, fit=FIT)
+    lines = parameter_lines(found, 120)
+    assert lines[1].endswith(f"{MISFIT}: another parameter")
+    assert lines[2:] == [
+        "misfit: images and targets differ by 6.1 % more than by noise; the spreads include as large a misfit that the "
+        "values may hide",
+        "these entries of `parameters` would reduce it:",
+        "  - {key: ball.alpha, bounds: [0.02, 1]}  # 98 % of the misfit; 0.2 would become 0.491",
+        "  - {key: rug.data}  # 31 % of the misfit; 1 1 1 would become 1.2 1 0.9",
+    ]
+    assert warnings(found) == [
+        f"{MISFIT}: lamp.radiance.value (images and targets differ by 6.1 % more than by noise) "
+        "(another parameter: - {key: ball.alpha, bounds: [0.02, 1]})"
+    ]
+    assert yaml.safe_load(lines[4]) == [{"key": "ball.alpha", "bounds": [0.02, 1]}]
+
+
+def test_a_misfit_without_a_cause_has_no_remedy():
+    found = judged({"verdict": MISFIT, "shares": {MISFIT: 1.0}}, fit=FIT | {"candidates": []})
+    assert advice(found) is None
+    assert len(parameter_lines(found, 120)) == 3
+    settled = judged({"verdict": "settled", "shares": {"settled": 1.0}}, fit=FIT | {"is_significant": False})
+    assert len(parameter_lines(settled, 120)) == 2
