@@ -19,11 +19,13 @@ import numpy as np
 import yaml
 
 from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
 from reslrb_cli.optimization.uncertainty.fit import Fit
 from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.records.decisions import Jsonable
+from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import Proposal, propose
@@ -41,8 +43,8 @@ LEAST_EIGENVALUE = 1e-3
 #: Number of parameters that are measured with `MORE` times the samples, up to a multiple of a step's, as long as noise
 #: leaves less than the share `LEAST_SURE` of their curvature.
 MOST_MEASURED_AGAIN, MORE, MOST_MULTIPLE, LEAST_SURE = 5, 4, 16, 0.8
-#: Maximum number of recorded parameters.
-MOST_RECORDED = 5
+#: Maximum numbers of tested and of recorded parameters.
+MOST_TESTED, MOST_RECORDED = 24, 5
 
 
 @dataclass(frozen=True)
@@ -157,17 +159,18 @@ def _test(
 
 
 def _unrecovered(problem: Problem) -> list[Proposal]:
-    """Return the parameters that could be recovered too, the most visible ones first."""
-    taken = {*problem.selection.scene_keys}
-    found = []
+    """Return the parameters that could be recovered too, the most visible ones first, at most `MOST_TESTED`."""
+    params, found = problem.selection.params, []
     for each in propose(problem.scene, problem.trained[0].sensor):
-        is_texture = len(each.info.shape) == 3
-        is_large = not is_texture and int(np.prod(each.info.shape)) > 4
-        if each.info.key not in taken and each.info.bits is None and not is_large:
+        info = each.info
+        is_large = len(info.shape) != 3 and int(np.prod(info.shape)) > SMALL
+        if info.key in problem.selection.scene_keys or info.bits is not None or is_large or info.value is None:
+            continue
+        low, high = open_domain(params, info.key)
+        if low <= info.value.low and info.value.high <= high:  # others would be moved, such as weights of 0
             found.append(each)
-    params = problem.selection.params
     moved = {item.key for item in where_moved(params, [each.info.key for each in found])}
-    return [each for each in found if each.info.key not in moved]
+    return [each for each in found if each.info.key not in moved][:MOST_TESTED]
 
 
 def scale_of(problem: Problem, proposal: Proposal) -> float:
