@@ -13,7 +13,7 @@ noise of channels that are fully correlated.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import yaml
@@ -22,9 +22,8 @@ from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
-from reslrb_cli.optimization.uncertainty.fit import Fit
+from reslrb_cli.optimization.uncertainty.fit import Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive
-from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.parameters import select_parameters
@@ -32,7 +31,7 @@ from reslrb_cli.scene.proposal import Proposal, propose
 from reslrb_cli.statistics import Array, rms, special
 
 #: Step of the differences, as a share of a parameter's scale.
-STEP = 0.05
+STEP = 0.1
 #: Largest `p` of residuals, or of a parameter, with which the model does not fit. Largest `p` of parameters that are
 #: then named.
 LEVEL, LEVEL_OF_NAMED = 0.004, 0.01
@@ -45,36 +44,6 @@ LEAST_EIGENVALUE = 1e-3
 MOST_MEASURED_AGAIN, MORE, MOST_MULTIPLE, LEAST_SURE = 5, 4, 16, 0.8
 #: Maximum numbers of tested and of recorded parameters.
 MOST_TESTED, MOST_RECORDED = 24, 5
-
-
-@dataclass(frozen=True)
-class FitRecord(Jsonable):
-    """Whether the model fits the targets. `p` is the probability that noise looks like the residuals or, if it is
-    smaller, like the effect of any of the tested parameters. `misfit` is the root mean square of the misfit over the
-    images, as a share of the target's. `energy` is twice the loss of the misfit. `candidates` are parameters that would
-    reduce the misfit, the most effective one first.
-    """
-
-    p: float
-    misfit: float
-    energy: float
-    is_significant: bool
-    candidates: list[Candidate]
-
-
-@dataclass(frozen=True)
-class Candidate(Jsonable):
-    """A parameter that would reduce the misfit: `explained` is the share of the misfit's loss, at most 1. `value` is
-    the present value, and `proposed` the value to which the test points; a texture has one factor for each channel.
-    `p` is the probability that noise shows any of the tested parameters like this one. `bounds` are YAML, or "".
-    """
-
-    key: str
-    p: float
-    explained: float
-    value: list[float]
-    proposed: list[float]
-    bounds: str = ""
 
 
 def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]) -> FitRecord:

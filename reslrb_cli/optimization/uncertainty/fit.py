@@ -32,6 +32,7 @@ from reslrb_cli.optimization.sensitivity import see_images
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature
 from reslrb_cli.optimization.uncertainty.noise import second_derivative
 from reslrb_cli.optimization.views import View, slope
+from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
 
@@ -53,6 +54,36 @@ MOST_CELLS = 64
 FLIPS, MOST_AT_ONCE = 499, 2**21
 #: Standard deviations of noise that the energy must exceed.
 LEAST_ENERGY = 3.0
+
+
+@dataclass(frozen=True)
+class Candidate(Jsonable):
+    """A parameter that would reduce the misfit: `explained` is the share of the misfit's loss, at most 1. `value` is
+    the present value, and `proposed` the value to which the test points; a texture has one factor for each channel.
+    `p` is the probability that noise shows any of the tested parameters like this one. `bounds` are YAML, or "".
+    """
+
+    key: str
+    p: float
+    explained: float
+    value: list[float]
+    proposed: list[float]
+    bounds: str = ""
+
+
+@dataclass(frozen=True)
+class FitRecord(Jsonable):
+    """Whether the model fits the targets. `p` is the probability that noise looks like the residuals or, if it is
+    smaller, like the effect of any of the tested parameters. `misfit` is the root mean square of the misfit over the
+    images, as a share of the target's. `energy` is twice the loss of the misfit. `candidates` are parameters that would
+    reduce the misfit, the most effective one first.
+    """
+
+    p: float
+    misfit: float
+    energy: float
+    is_significant: bool
+    candidates: list[Candidate]
 
 
 @dataclass(frozen=True)

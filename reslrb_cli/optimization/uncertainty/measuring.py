@@ -15,7 +15,6 @@ from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
-from reslrb_cli.optimization.uncertainty.candidates import judge_fit
 from reslrb_cli.optimization.uncertainty.coupling import Maps, followed, measure_maps, with_followed
 from reslrb_cli.optimization.uncertainty.curvature import (
     EntryCurvature,
@@ -112,6 +111,8 @@ class Certainty:
         """
         if iterations < LEAST_ITERATIONS:
             return None
+        from reslrb_cli.optimization.uncertainty.candidates import judge_fit  # late, because it imports SciPy
+
         problem, config, clock, compiled_ms = self.problem, self.problem.config, StepClock(), 0.0
         try:
             problem.apply()

@@ -45,9 +45,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reslrb_cli.optimization.optimizers import SMALL
-from reslrb_cli.optimization.uncertainty.candidates import FitRecord
 from reslrb_cli.optimization.uncertainty.coupling import Maps, texel_offsets
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
+from reslrb_cli.optimization.uncertainty.fit import FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import (
     CURVATURE_ERROR,
     SURE,
