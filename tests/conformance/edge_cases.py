@@ -421,6 +421,9 @@ VIEWS: dict[str, Callable[[], dict[str, Any]]] = {
     "glowing": lambda: _around_square(camera=_camera([0, 0, 0], [0, 2, 0], VIEW, stddev=0.9), lamp=lit_square(
         rgb(4, 4, 4), transform(translate=[0.1, -0.2, 0.05], rotate=([1, 0, 0], -90), scale=0.25))),
     "blended": lambda: _mirrored(blended(False)), "blended_last": lambda: _mirrored(blended(True)),
+    # A lamp near the camera covers the square's reflection.
+    "covered": lambda: _mirrored({"type": "conductor"}) | {"cover": lit_square(
+        rgb(4, 4, 4), transform(translate=[0, 0.2, 0], rotate=([1, 0, 0], 90), scale=0.02))},
 }  # fmt: skip
 
 # ---- The cases ----

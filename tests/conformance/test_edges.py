@@ -215,6 +215,8 @@ FAULTS = [
           " - view.clip", ""),
     Fault("mirrors_show_no_hidden_lamp", "lamp_in_a_mirror", "transport.camera:camera_walk",
           "plan.sees_through_lamps and first.begins_path", "plan.sees_through_lamps"),
+    Fault("chains_meet_hidden_lamps", "lamp_before_a_mirror", "transport.chains:SensorChains.sees_through_lamps",
+          "self.samples.plan.sees_through_lamps", "False"),
     Fault("points_of_a_flat_lamp_light_each_other", "lamp_in_a_moved_mirror", "transport.chains:Chains.lit",
           " & (height > ray_offset(hit.si.p))", ""),
     Fault("parallel_light_has_no_edges", "parallel_light", "transport.plan:Plan.finding_beams",
@@ -349,6 +351,12 @@ def check_hidden_lamp() -> None:
     check_alike(hidden.gradients(1), clipped.gradients(1), limit=0.02)
 
 
+def check_lamp_before_a_mirror() -> None:
+    """Assert that a hidden lamp does not hide what a mirror behind it shows."""
+    hidden = EdgeCase("square_0.3", "covered", 3, ("x", "z"), spp=16, options=CAMERA | HIDDEN)
+    check_alike(hidden.gradients(1), replace(hidden, near_clip=0.3, options=CAMERA).gradients(1), limit=0.02)
+
+
 def check_lamp_in_a_mirror() -> None:
     """Assert that a mirror shows a hidden lamp."""
     hidden = EdgeCase("facing", "glowing", motion=("y", "turn"), spp=16, options=CAMERA | HIDDEN)
@@ -395,6 +403,7 @@ EXACT: dict[str, Callable[[pytest.MonkeyPatch], None]] = {
     "points": lambda monkeypatch: check_points("sensor", False),
     "hidden_lamp": lambda monkeypatch: check_hidden_lamp(),
     "lamp_in_a_mirror": lambda monkeypatch: check_lamp_in_a_mirror(),
+    "lamp_before_a_mirror": lambda monkeypatch: check_lamp_before_a_mirror(),
     "lamp_in_a_moved_mirror": lambda monkeypatch: test_edge_geometry.test_the_outline_of_a_lamp_in_a_moved_mirror(),
     "parallel_light": lambda monkeypatch: check_parallel_light(),
     "blended_mirror": lambda monkeypatch: check_blended_mirror(),

@@ -219,6 +219,7 @@ def test_a_texture_without_a_measured_curvature_is_below_the_noise():
 NOT_SEEN, AT_BOUND = ParameterVerdict.NOT_SEEN.value, ParameterVerdict.AT_BOUND.value
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("curvature", ["none", "unknown", "known"])
 @pytest.mark.parametrize("recorded", [False, True])
 @pytest.mark.parametrize("seen", ["none", "one", "all"])
