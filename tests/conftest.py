@@ -10,7 +10,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,25 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--part", type=read_part, metavar="K/N", default=(1, 1), help=text)
 
 
+class FromTheEnd(pytest.Dir):
+    """Folder whose files are collected from the last to the first."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        return reversed([*super().collect()])
+
+
+def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """Let every other worker collect from the end. Workers store the files that pytest has rewritten for them, which
+    takes as long as the import of everything else. They meet in the middle, and none rewrites the files of another.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0")
+    return FromTheEnd.from_parent(parent, path=path) if int(worker.removeprefix("gw")) % 2 else None
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the tests of other parts, and tests that need a browser if there is no browser."""
+    """Sort tests by file. Leave out the tests of other parts, and tests that need a browser if there is no browser."""
+    items.sort(key=lambda item: item.path.parts)
     chosen = in_part(items, *config.getoption("part"))
     if len(chosen) < len(items):
         config.hook.pytest_deselected(items=[item for item in items if item not in chosen])

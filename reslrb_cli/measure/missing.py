@@ -204,23 +204,25 @@ def share_of(whole: np.ndarray, missing: np.ndarray) -> tuple[float, float] | No
     (part, part_noise), (size, noise) = _squared_mean(missing), _squared_mean(whole)
     if size <= limit**2 * noise:
         return None
-    found = _ratio(missing, whole)
+    found = float(_ratio(missing, whole))
     if part + part_noise <= limit**2 * part_noise:
         return found, float(np.sqrt(part_noise / size))
     # The noise of the part and of the whole: leave out one seed at a time (jackknife).
-    without = [_ratio(np.delete(missing, k, 0), np.delete(whole, k, 0)) for k in range(count)]
-    return found, float(np.sqrt(jackknife_variance(np.array(without))))
+    others = np.nonzero(~np.eye(count, dtype=bool))[1].reshape(count, -1)
+    return found, float(np.sqrt(jackknife_variance(_ratio(missing[others], whole[others]))))
 
 
-def _ratio(part: np.ndarray, whole: np.ndarray) -> float:
-    """Return rms(part) / rms(whole) for samples (N, K). rms is the root mean square of the means, without noise."""
-    return float(np.sqrt(max(_squared_mean(part)[0], 0.0) / _squared_mean(whole)[0]))
+def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return rms(part) / rms(whole) for samples (..., N, K). rms is the root mean square of the means, without
+    noise.
+    """
+    return np.asarray(np.sqrt(np.maximum(_squared_mean(part)[0], 0.0) / _squared_mean(whole)[0]))
 
 
-def _squared_mean(samples: np.ndarray) -> tuple[float, float]:
-    """Return the squared norm of the mean of samples (N, K) without the part due to noise, and that part."""
-    noise = float(samples.var(0, ddof=1).sum()) / len(samples)
-    return float(np.square(samples.mean(0)).sum()) - noise, noise
+def _squared_mean(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the squared norm of the mean of samples (..., N, K) without the part due to noise, and that part."""
+    noise = samples.var(-2, ddof=1).sum(-1) / samples.shape[-2]
+    return np.square(samples.mean(-2)).sum(-1) - noise, noise
 
 
 #: Maximum numbers of seeds and views.

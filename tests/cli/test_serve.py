@@ -53,7 +53,7 @@ def runs(llvm, tmp_path):
 def served(runs):
     """The address of a server of `runs`."""
     with serve.make_server(runs, 0) as server:
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,))  # the time that `shutdown` waits
         thread.start()
         yield server.server_port
         server.shutdown()
