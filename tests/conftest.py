@@ -16,7 +16,14 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from compilation import allocate_registers, combine, compute_alone, leave_out_optimisations, show_fatal_errors
+from compilation import (
+    allocate_registers,
+    combine,
+    compute_alone,
+    gather_at_once,
+    leave_out_optimisations,
+    show_fatal_errors,
+)
 from golden import said
 from kit import with_wavelengths, work_in
 from report.chromium import Chromium, find_chromium
@@ -160,6 +167,7 @@ def llvm(pytestconfig: pytest.Config) -> str:
     variant = tested_variant()
     if variant.startswith("llvm") and is_quick(pytestconfig):
         compute_alone()
+        gather_at_once()
     return variant
 
 

@@ -17,6 +17,7 @@ from urllib.parse import quote
 import pytest
 from cli import tiny
 from cli.tiny import reslrb
+from report.chromium import PATIENCE
 from report.measured import make_run
 
 import reslrb_cli.report.page as page_module
@@ -361,14 +362,14 @@ def test_the_pages_in_a_browser(served, runs, chromium, monkeypatch):
     loaded = "document.readyState == 'complete'"
     for _ in range(2):
         chromium.evaluate("window.seen = 1")
-        assert chromium.wait_for(f"window.seen != 1 && {loaded} && scrollY == 500", 10)
+        assert chromium.wait_for(f"window.seen != 1 && {loaded} && scrollY == 500", PATIENCE)
     monkeypatch.setattr(page_module, "REFRESH_SECONDS", 3600)  # no page reloads while its links are clicked
-    assert chromium.wait_for(f"document.body?.dataset.reload == 3600 && {loaded}", 10)
+    assert chromium.wait_for(f"document.body?.dataset.reload == 3600 && {loaded}", PATIENCE)
     click = "[...document.querySelectorAll('a')].find(a => decodeURI(a.href).includes('%s')).click()"
     chromium.evaluate(click % "with=b")
-    assert chromium.wait_for(f"document.body?.textContent.includes('to compare with b') && {loaded}", 10)
+    assert chromium.wait_for(f"document.body?.textContent.includes('to compare with b') && {loaded}", PATIENCE)
     chromium.evaluate(click % "run=a")
-    assert chromium.wait_for(f"document.querySelectorAll('svg').length == 4 && {loaded}", 10)
+    assert chromium.wait_for(f"document.querySelectorAll('svg').length == 4 && {loaded}", PATIENCE)
     assert chromium.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
     assert chromium.evaluate("document.images.length") >= 4
     assert chromium.evaluate("document.documentElement.scrollWidth") <= 1280

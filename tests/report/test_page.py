@@ -12,6 +12,7 @@ import time
 
 import numpy as np
 import pytest
+from report.chromium import PATIENCE
 from report.measured import (
     FLOOR,
     LAMP,
@@ -443,7 +444,7 @@ def test_the_border_is_dragged_on_the_picture_and_a_click_enlarges_it(chromium, 
     left = "document.querySelector('dialog img').src == document.querySelector('.stage img:last-child').src"
     assert chromium.evaluate(left)
     chromium.evaluate("document.querySelector('dialog').click()")
-    assert chromium.wait_for("document.querySelectorAll('dialog').length == 0", 10)
+    assert chromium.wait_for("document.querySelectorAll('dialog').length == 0", PATIENCE)
 
 
 def test_a_page_in_progress_keeps_the_reader_s_place(chromium, tmp_path, monkeypatch):
@@ -457,7 +458,7 @@ def test_a_page_in_progress_keeps_the_reader_s_place(chromium, tmp_path, monkeyp
     time.sleep(0.7)
     assert chromium.evaluate("[window.seen, document.querySelectorAll('dialog').length]") == [1, 1]
     chromium.evaluate("document.querySelector('dialog').click()")
-    assert chromium.wait_for("window.seen != 1 && document.readyState == 'complete'", 10)
+    assert chromium.wait_for("window.seen != 1 && document.readyState == 'complete'", PATIENCE)
     assert chromium.evaluate("document.querySelector('.compare input').value") == "30"
 
 
@@ -478,7 +479,7 @@ def test_the_page_of_a_running_run_reloads_until_the_end(chromium, pages, tmp_pa
     chromium.open(path, 1400)
     assert chromium.evaluate("document.querySelector('.status').textContent") == "running"
     write_report(folder)
-    assert chromium.wait_for("document.querySelector('.status')?.textContent == 'finished'", 10)
+    assert chromium.wait_for("document.querySelector('.status')?.textContent == 'finished'", PATIENCE)
     chromium.events.clear()
     assert not chromium.wait_for("false", 1)
     assert chromium.requests() == []
