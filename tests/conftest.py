@@ -59,8 +59,11 @@ def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Col
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Sort tests by file. Leave out the tests of other parts, and tests that need a browser if there is no browser."""
-    items.sort(key=lambda item: item.path.parts)
+    """Give all workers the same order. Leave out the tests of other parts, and tests that need a browser if there is no
+    browser.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        items.sort(key=lambda item: item.path.parts)
     chosen = in_part(items, *config.getoption("part"))
     if len(chosen) < len(items):
         config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
