@@ -106,6 +106,15 @@ def test_light_is_classified_by_its_destination(lens: Path) -> None:
     assert found["beyond"] == pytest.approx(10 * wide / 75, abs=3e-3)
 
 
+@pytest.mark.parametrize(("bounces", "whole"), [(2, 0), (3, 1)])
+def test_light_that_has_not_ended_does_not_count(
+    lens: Path, monkeypatch: pytest.MonkeyPatch, bounces: int, whole: int
+) -> None:
+    """Rays meet the back, the face and then the receiver, where they end."""
+    monkeypatch.setattr(workshop, "BOUNCES", bounces)
+    assert sum(light_of(with_face(lens, np.zeros_like)).values()) == pytest.approx(whole)
+
+
 @pytest.mark.long
 def test_shares_match_a_film_that_sees_the_whole_receiver(lens: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reference is Mitsuba's light tracer with as many reflections. The receiver is so dark that no light returns

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -395,6 +396,109 @@ def test_an_error_of_the_user_reaches_the_run_as_text(me: SimpleNamespace) -> No
     assert type(pickle.loads(pickle.dumps(raised.value))) is ReslrbError
 
 
+def test_a_worker_removes_the_files_of_its_workload(me: SimpleNamespace) -> None:
+    workload = calls.Workload({"a": b"one"}, reads, key="k")
+    assert uppercase(me, workload) == "ONE"
+    folder = Path(me.local_directory) / "reslrb-k"
+    assert [path.name for path in folder.iterdir()] == ["a"]
+    for _ in range(2):  # dask may have removed the folder
+        workload.teardown(me)
+        assert not folder.exists()
+
+
+def test_a_workload_is_loaded_once(me: SimpleNamespace) -> None:
+    """It gets its arguments, and the folder of its files."""
+    loaded: list[Any] = []
+
+    def load(folder: Path, threads: int | None, *arguments: Any) -> tuple[str, dict[str, float]]:
+        loaded.append((sorted(path.name for path in folder.iterdir()), threads, arguments))
+        return "state", {}
+
+    me.plugins["reslrb"] = workload = calls.Workload({"a": b"1", "b": b"2"}, load, (True, 7), 3)
+    for function, given, value in ((str.upper, (), "STATE"), (str.replace, ("s", "p"), "ptate")):
+        assert calls.perform(workload.key, b"", function, given) == value
+    assert loaded == [(["a", "b"], 3, (True, 7))]
+    assert calls.perform(workload.key, b"", calls._load, ()) is None
+
+
+@dataclass(eq=False)
+class _Future:
+    """Answer to a call."""
+
+    value: object
+    release: Callable[[], None]
+
+    def result(self) -> object:
+        return self.value
+
+
+class _Client:
+    """Client of one worker that computes in this process. Answers arrive in the reverse order."""
+
+    loop, status = None, "running"
+
+    def __init__(self, workers: int = 2) -> None:
+        self.told: list[Any] = []
+        self.workers = workers
+
+    def subscribe_topic(self, topic: str, tell: Callable[[Any], None]) -> None:
+        self.told.append(topic)
+        self.tell = tell
+
+    def wait_for_workers(self, count: int, timeout: int) -> None:
+        self.told.append((count, timeout))
+
+    def register_plugin(self, plugin: Any) -> None:
+        self.told.append(plugin.key)
+
+    def scheduler_info(self, n_workers: int) -> dict[str, Any]:
+        assert n_workers == -1  # all of them
+        return {"workers": dict.fromkeys(range(self.workers))}
+
+    def submit(self, function: object, *given: Any, pure: bool) -> _Future:
+        assert not pure  # equal calls are computed again
+        assert function is calls.perform
+        key, context, work, arguments = given
+        value = key, context and pickle.loads(context), work.__name__, arguments
+        return _Future(value, lambda: self.told.append("released"))
+
+
+def test_the_calls_of_a_run(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """Each worker loads the workload first. Answers have the places of their calls."""
+    monkeypatch.setattr(calls, "as_completed", lambda futures, loop: reversed(list(futures)))
+    client: Any = _Client()
+    workload = SimpleNamespace(key="k")
+    workers = calls.Workers(client, workload, lambda state: f"context of {state}")  # type: ignore[arg-type]
+    assert client.told == ["reslrb", (1, connection.NOBODY_S), "k", "released", "released"]
+    found = list(workers("s", str.upper, [("a",), ("b",)]))
+    assert found == [(1, ("k", "context of s", "upper", ("b",))), (0, ("k", "context of s", "upper", ("a",)))]
+    client.tell(("time", "worker 1 is restarted"))
+    assert caplog.messages == ["--cluster: worker 1 is restarted"]
+
+
+def test_the_standing_of_a_step_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers get the values of the optimiser and the learned tables, then apply them to the scene."""
+    done: list[Any] = []
+    guiding = SimpleNamespace(state=lambda: ({"0": 3}, {"0/a": np.ones(2)}))
+    problem: Any = SimpleNamespace(optimizer={"a": np.float32([1, 2])}, apply=lambda: done.append("apply"))
+    monkeypatch.setattr(engine, "guiding_of", lambda problem: guiding)
+    standing = engine.Standing.of(problem)
+    assert (standing.values["a"].tolist(), standing.calls, list(standing.learned)) == ([1, 2], {"0": 3}, ["0/a"])
+    monkeypatch.setattr(engine, "guiding_of", lambda problem: None)
+    assert (engine.Standing.of(problem).calls, engine.Standing.of(problem).learned) == ({}, {})
+
+    class Optimizer(dict[str, Any]):
+        def set_value(self, key: str, value: Any) -> None:
+            done.append((key, value))
+
+    problem.optimizer = Optimizer(a=0)
+    monkeypatch.setattr(engine.dr, "detach", lambda value: value)
+    monkeypatch.setattr(engine, "like", lambda known, value: (known, value.tolist()))
+    monkeypatch.setattr(engine, "restore_tables", lambda problem, calls, learned: done.append((calls, list(learned))))
+    standing.take(problem)
+    assert done == [("a", (0, [1, 2])), ({"0": 3}, ["0/a"]), "apply"]
+
+
 def test_a_worker_with_other_tables_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "restore_tables", lambda *given: "wall: 3 cells, not 4")
     with pytest.raises(MachineError, match="a worker has other guiding tables than the run: wall: 3 cells, not 4"):
@@ -742,6 +846,8 @@ def test_connections_are_encrypted(tmp_path: Path) -> None:
         security: Any = connection._certificates()
     assert security.require_encryption
     assert security.tls_client_key == files["key.pem"]
+    with dask.config.set({**settings, f"{tls}.client.key": "-----BEGIN KEY-----\nabc\n"}):  # not a file
+        assert connection._certificates().tls_client_key.startswith("-----BEGIN")  # type: ignore[attr-defined]
     for wrong, why in (("", "is not set; give the file, for example by DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT=FILE"),
                        ("gone.pem", "gone.pem cannot be read")):  # fmt: skip
         with (

@@ -374,6 +374,7 @@ def test_a_continued_run_keeps_its_past_and_tidies_up(run: Path) -> None:
     }
     first, second = found["resumed"]
     assert (first, second["iteration"], second["changed"]) == ({"iteration": 2}, 4, {})
+    assert not os.path.lexists(run.parent / "latest")  # the link stays at the newest run
     assert second["versions"] == {"mitsuba": ["0.1", manifest["versions"]["mitsuba"]]}
     assert list(run.rglob(".*.part")) == []
 

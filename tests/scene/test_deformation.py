@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -11,7 +12,7 @@ import pytest
 
 from reslrb_cli.config.parameters import ImageFile, ParameterSpec
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.scene.deformation import _corners, _Lookup
+from reslrb_cli.scene.deformation import Surroundings, _corners, _Lookup
 from reslrb_cli.scene.parameters import select_parameters, set_values
 
 WORDS = ["translation", "rotation", "scale"]
@@ -336,3 +337,30 @@ def test_an_emitting_mesh_moves(scene):
     assert selection.keys == ["glow.translation"]
     assert selection.scene_keys == ["glow.vertex_positions"]
     assert np.array_equal(positions(selection), before)  # the box does not move
+
+
+@pytest.mark.usefixtures("llvm")
+def test_the_sphere_around_a_scene_changes_as_seldom_as_possible() -> None:
+    """Each size compiles kernels. A sphere that has become too small grows with a margin; one that is much too large
+    shrinks. Only emitters at infinity use it.
+    """
+    told: list[tuple[str, float]] = []
+
+    def emitter(name: str, flag: mi.EmitterFlags) -> SimpleNamespace:
+        return SimpleNamespace(
+            flags=lambda: int(flag), set_scene=lambda scene: told.append((name, scene.bbox().bounding_sphere().radius))
+        )
+
+    emitters = [emitter("sky", mi.EmitterFlags.Infinite), emitter("lamp", mi.EmitterFlags.Surface)]
+    around, half = Surroundings(), 3**-0.5
+    found = []
+    for size, shift in ((1, 0), (0.9, 0), (1, 0.5), (0.9, 0.5), (0.5, 0.5), (0.1, 0.5)):
+        low, high = ([sign * half * size + shift for _ in range(3)] for sign in (-1, 1))
+        box = mi.ScalarBoundingBox3f(low, high)
+        scene: Any = SimpleNamespace(bbox=lambda box=box: box, emitters=lambda: emitters)
+        horizon = around.follow(scene)
+        found.append(horizon.radius)
+        assert horizon.holds(box)
+    assert found == pytest.approx([1, 1, 1.25, 1.25, 0.625, 0.125], rel=1e-5)
+    assert [name for name, _ in told] == ["sky"] * 4
+    assert [radius for _, radius in told] == pytest.approx([1, 1.25, 0.625, 0.125], rel=1e-5)
