@@ -3,6 +3,8 @@
 # ruff: noqa: F401  # the table uses the modules
 from __future__ import annotations
 
+import contextlib
+import io
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +20,7 @@ from kit import work_in
 from records.test_metrics import make_record
 
 from reslrb_cli import errors
-from reslrb_cli.cli import example, init, inspect, jobs, optimize, options, render, serve, terminal
+from reslrb_cli.cli import example, gradcheck, init, inspect, jobs, optimize, options, render, report, serve, terminal
 from reslrb_cli.cluster import connection
 from reslrb_cli.config.loader import parse_override
 from reslrb_cli.records import (
@@ -101,6 +103,12 @@ workshop.shift_between(np.roll(SPOT, (2, -3), (0, 1)), SPOT)
 inspect._reasons([info(None, (), obstacle=o) for o in ("b (1)", "b (2)", "a; c", "a")])
 [inspect.run_words(run) for run in ({}, {"status": "failed", "error": "x", "results": {"iterations": 3}}, {"status": "running"})]
 inspect.moving_lines([{"id": f"s{n}", "by": ["motion"] if n % 2 else ["motion", "heightmap"]} for n in range(25)], False)
+[inspect.moving_lines([{"id": f"s{n}", "by": ["motion"]} for n in range(count)], every) for count in (9, 10, 11) for every in (False, True)]
+[len(inspect.parameter_lines([info(None, (), key=f"k{n:02d}") for n in range(count)], [], False)) for count in (29, 30, 31)]
+[printed(init._tell_sensor, 0, [f"s{n}" for n in range(count)]) for count in (1, 2, 3, 4, 5)]
+[printed(init._tell_sensor, 9, [f"s{n}" for n in range(count)]) for count in (1, 2, 3, 4, 5)], printed(init._tell_sensor, 2, ["a", "b"])
+[shown_together(count) for count in (99, 100, 101)]
+[share_left(seeds, budget) for seeds in (0, 2) for budget in (-1.0, 100.0)]
 inspect.moving_lines([], False), inspect.moving_lines([{"id": "a", "by": ["motion"]}], True)
 inspect.parameter_lines([info(None, (), key=f"k{n:02d}") for n in range(40)], ["k35", "k3[01]"], False)
 inspect.parameter_lines([info(None, (), obstacle="x", bits=8), info(None, (), key="b", bits=16)], [], True)
@@ -289,6 +297,38 @@ def left(status: str | None, has_failed: bool) -> bool:
 
 def node(kind: str) -> Any:
     return SimpleNamespace(class_name=lambda: kind)
+
+
+def printed(function: Any, *given: Any) -> str:
+    """Return what a function prints on both streams, or its error."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            function(*given)
+        except errors.ReslrbError as error:
+            return f"{type(error).__name__}: {error}"
+    return out.getvalue() + err.getvalue()
+
+
+def shown_together(count: int) -> str:
+    """Return why the command `report` refuses this number of runs."""
+    with pytest.raises(errors.ConfigError) as refused:
+        report.command.callback(tuple(Path("gone") for _ in range(count)), None)  # type: ignore[misc]
+    return str(refused.value)
+
+
+def share_left(seeds: int, budget: float) -> list[Any]:
+    """Return the exit code and the output of `gradcheck --missing` if a measurement takes this number of seeds."""
+    check: Any = SimpleNamespace(
+        conditions=lambda: "conditions", keys=["a", "b"], source="c.yaml",
+        measured=lambda key, affords, count, looks: missing(0.3, 0.01, seeds),
+    )  # fmt: skip
+    found: list[Any] = []
+    asked: Any = SimpleNamespace(spp=None, json_file=None, seeds=None, budget=budget)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("reslrb_cli.measure.missing.MissingCheck.of_config", lambda config, spp: check)
+        said = printed(lambda: found.append(int(gradcheck.run_missing(asked, None, "llvm_ad_rgb"))))  # type: ignore[arg-type]
+    return [*found, said]
 
 
 def bar_text(columns: int | None) -> list[Any]:

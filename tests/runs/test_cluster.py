@@ -4,6 +4,7 @@ matter.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import pickle
@@ -474,6 +475,36 @@ def test_the_calls_of_a_run(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogC
     assert found == [(1, ("k", "context of s", "upper", ("b",))), (0, ("k", "context of s", "upper", ("a",)))]
     client.tell(("time", "worker 1 is restarted"))
     assert caplog.messages == ["--cluster: worker 1 is restarted"]
+
+
+@pytest.mark.parametrize("threads", [None, 3])
+def test_the_order_of_assembling(monkeypatch: pytest.MonkeyPatch, threads: int | None) -> None:
+    """Files are compared first, and the memory of a step is checked before the run's decisions."""
+    done: list[Any] = []
+
+    def note(name: str, result: Any = None) -> Callable[..., Any]:
+        return lambda *given: (done.append(name), result)[1]
+
+    config = SimpleNamespace(with_code=lambda allowed: ("config", allowed))
+    settled = SimpleNamespace(config="text", files={}, variant="llvm_ad_rgb")
+    stored = SimpleNamespace(path=Path("state.npz"), read=lambda kind: settled)
+    monkeypatch.setattr(engine, "Stored", lambda path: stored)
+    monkeypatch.setattr(engine, "loads", lambda text, path: config)
+    monkeypatch.setattr(engine.np, "load", lambda path: contextlib.nullcontext({"0": path.name}))
+    decided = SimpleNamespace(views=["view"])
+    for name, result in (("check_files", None), ("set_variant", None), ("begin_as", None), ("check_step", None),
+                         ("decide_as", decided)):  # fmt: skip
+        monkeypatch.setattr(engine, name, note(name, result))
+    monkeypatch.setattr(engine, "assemble_scene", lambda config: done.append(config))
+    monkeypatch.setattr(engine, "set_targets", lambda views, targets: done.append((views, targets)))
+    monkeypatch.setattr(engine, "_warmed", lambda problem: {"found": 1.0})
+    monkeypatch.setattr(engine.dr, "sync_thread", note("sync"))
+    monkeypatch.setattr(engine.dr, "set_thread_count", done.append)
+    assert engine.assembled(Path("folder"), threads, True) == (decided, {"found": 1.0})
+    assert done == [
+        "check_files", "set_variant", ("config", True), "begin_as", "check_step", "decide_as",
+        (["view"], {"0": "targets.npz"}), *(["sync", 3] if threads else []),
+    ]  # fmt: skip
 
 
 def test_the_standing_of_a_step_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
