@@ -29,7 +29,7 @@ _is_close = partial(math.isclose, rel_tol=0.01, abs_tol=1e-6)
 def check(name: str, found: Any) -> None:
     """Compare a text, or a value for JSON, with the stored one of this `name`. Decimals may differ by a hundredth."""
     found = json.loads(json.dumps(found.splitlines() if isinstance(found, str) else found, default=str))
-    content = _stored()
+    content = stored()
     if mode := os.environ.get("RESLRB_GOLDEN"):
         content[name] = _stable(found, content.get(name)) if mode == "unstable" else found
         FILE.write_text(_written(content))
@@ -38,7 +38,8 @@ def check(name: str, found: Any) -> None:
 
 
 @cache
-def _stored() -> dict[str, Any]:
+def stored() -> dict[str, Any]:
+    """Return everything that is stored, by name."""
     found: dict[str, Any] = json.loads(FILE.read_text())
     return found
 
