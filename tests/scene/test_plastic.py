@@ -128,3 +128,6 @@ def test_each_pass_of_a_step_adds_the_same() -> None:
         sums.append(float(dr.grad(leaves["floor.opacity.value"])[0]))
     first, *others = np.diff(sums)
     assert others == pytest.approx([first, first], rel=1e-4)
+    # With one thread, the derivative is right even if the sampling weight has a derivative.
+    [node] = {node for _, _, node, _ in case.params.properties.values() if node.class_name() == "SmoothPlastic"}
+    assert plastic_tables._arrays(node)[-1] >> 32 == 0
