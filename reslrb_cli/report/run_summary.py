@@ -277,7 +277,8 @@ def misfit_lines(results: Mapping[str, Any]) -> list[str]:
     lines += ["these entries of `parameters` would reduce it:"] if found else []
     for each in found:
         old, new = (" ".join(number(value, 3) for value in each[name]) for name in ("value", "proposed"))
-        lines.append(f"  {spec_of(each)}  # {100 * each['explained']:.2g} % of the misfit; {old} would become {new}")
+        change = f"; {old} would become about {new}" if new else ""
+        lines.append(f"  {spec_of(each)}  # {100 * each['explained']:.0f} % of the misfit{change}")
     return lines
 
 

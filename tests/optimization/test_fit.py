@@ -84,6 +84,15 @@ def test_large_images_have_few_cells():
     assert fit.compare(np.ones((1, 1, 3)), np.random.default_rng(0)).p == 1.0
 
 
+def test_offsets_of_textures_explain_a_part():
+    found = fit.FitRecord(0.002, 0.1, 4.0, True, [fit.Candidate("a", 0.001, 1.0, [1.0], [2.0])])
+    part = found.without(3.0)
+    assert (part.misfit, part.energy, part.is_significant) == (0.05, 1.0, True)
+    assert len(part.candidates) == 1
+    for energy in (4.0, 5.0):
+        assert found.without(energy) == fit.FitRecord(0.002, 0.0, 0.0, False, [])
+
+
 def linear(random: Random, known: int, planted: float) -> tuple[candidates._Tests, np.ndarray]:
     """Return the tests of two further parameters of a linear model after its `known` parameters were recovered. The
     first one is wrong by `planted`. Return also the derivatives of its images.

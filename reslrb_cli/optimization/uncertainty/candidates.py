@@ -163,8 +163,10 @@ def _candidate(
         proposed = value.copy()
         proposed[[direction.entry for direction in directions]] += offset
     low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
-    shown = np.clip(proposed, low, high) if directions[0].entry is not None else np.maximum(proposed, 0.0)
-    return Candidate(key, p, 0.0, [float(x) for x in value], [float(x) for x in shown], proposal.bounds or "")
+    if directions[0].entry is None:
+        low, high = 0.0, np.inf
+    is_inside = bool(np.all((low < proposed) & (proposed < high)))
+    return Candidate(key, p, 0.0, value.tolist(), proposed.tolist() if is_inside else [], proposal.bounds or "")
 
 
 class _Tests:

@@ -21,7 +21,7 @@ to be as large as the one that is left.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -59,7 +59,8 @@ LEAST_ENERGY = 3.0
 @dataclass(frozen=True)
 class Candidate(Jsonable):
     """A parameter that would reduce the misfit: `explained` is the share of the misfit's loss, at most 1. `value` is
-    the present value, and `proposed` the value to which the test points; a texture has one factor for each channel.
+    the present value, and `proposed` the value to which the test points, empty if this is outside of the bounds; a
+    texture has one factor for each channel.
     `p` is the probability that noise shows any of the tested parameters like this one. `bounds` are YAML, or "".
     """
 
@@ -84,6 +85,15 @@ class FitRecord(Jsonable):
     energy: float
     is_significant: bool
     candidates: list[Candidate]
+
+    def without(self, energy: float) -> FitRecord:
+        """Return the record without the part of the energy that offsets of the recovered values explain. Without any
+        energy left, the model fits.
+        """
+        left = max(self.energy - energy, 0.0)
+        if left == 0:
+            return replace(self, misfit=0.0, energy=0.0, is_significant=False, candidates=[])
+        return replace(self, misfit=self.misfit * (left / self.energy) ** 0.5, energy=left)
 
 
 @dataclass(frozen=True)

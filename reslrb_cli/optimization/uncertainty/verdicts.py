@@ -29,7 +29,7 @@ If the derivative of a parameter lacks a significant share, or if this share is 
 incomplete`. A run measures the missing share before its first iteration (`measure/missing.py`).
 
 If the model does not fit the targets (`fit.py`), spreads include the offset that the misfit may have caused. A
-`settled` parameter that is not settled with these spreads gets the verdict `MISFIT`.
+`settled` parameter that a larger misfit would unsettle gets the verdict `MISFIT`.
 
 A small parameter is `settled` if at least `SETTLED_SHARE` of its entries with an effect are settled. The entries of a
 large parameter are judged in groups. If the limit of their root mean square is at most tau, all of them are settled.
@@ -310,15 +310,18 @@ def weigh(
     return result
 
 
-def with_misfit(found: Mapping[str, ParameterCertainty], wider: Mapping[str, ParameterCertainty]
-                ) -> dict[str, ParameterCertainty]:  # fmt: skip
+def with_misfit(
+    found: Mapping[str, ParameterCertainty],
+    wider: Mapping[str, ParameterCertainty],
+    widest: Mapping[str, ParameterCertainty],
+) -> dict[str, ParameterCertainty]:
     """Return the certainty with the spreads of `wider`, which include the misfit of the model. Settled parameters that
-    are not settled in `wider` get the verdict `MISFIT`.
+    are not settled in `widest` get the verdict `MISFIT`.
     """
     settled, misfit, result = ParameterVerdict.SETTLED.value, ParameterVerdict.MISFIT.value, {}
     for key, about in found.items():
         about = replace(about, spread=wider[key].spread)
-        if about.verdict == settled and wider[key].verdict != settled:
+        if about.verdict == settled and widest[key].verdict != settled:
             shares = {misfit if name == settled else name: share for name, share in about.shares.items()}
             about = replace(about, verdict=misfit, shares=shares)
         result[key] = about
