@@ -51,7 +51,8 @@ def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[
 
     `known` has measured the recovered directions. The test of further parameters ends when `go_on` returns false.
     """
-    found = _find_candidates(problem, fit, known, go_on)
+    # Noise may hide a curvature, but no parameter removes more than the residuals.
+    found = [(min(fall, 0.5 * fit.total), p, each) for fall, p, each in _find_candidates(problem, fit, known, go_on)]
     p = min([fit.p, *(own for _, own, _ in found)])
     is_significant = p <= LEVEL
     named = [each for each in found if is_significant and each[1] <= LEVEL_OF_NAMED]

@@ -109,11 +109,12 @@ class Residual:
 @dataclass(frozen=True)
 class Fit:
     """Result of the test of fit. `p` is the probability that noise looks like the residuals. `energy` is twice the loss
-    of the misfit, and `size` is twice the loss of black images.
+    of the misfit, `total` that of the whole residuals, and `size` that of black images.
     """
 
     p: float
     energy: float
+    total: float
     size: float
     residuals: list[Residual]
 
@@ -128,7 +129,7 @@ def measure_fit(problem: Problem, curvature: LossCurvature) -> Fit:
     count = max(IMAGES, -(-LEAST_SPP // spp))
     images = [see_images(problem, spp, -each, PURPOSE) for each in range(count)]
     random = np.random.default_rng(seed(problem.config.run.seed, 0, 0, PURPOSE))
-    judged, energy, size = [], 0.0, 0.0
+    judged, energy, total, size = [], 0.0, 0.0, 0.0
     residuals: list[Residual] = []
     means = [np.array(samples, dtype=np.float64).mean(axis=0) for samples in zip(*images, strict=True)]
     slopes = [finite(slope(view.judge, mean)) * view.share for view, mean in zip(problem.trained, means, strict=True)]
@@ -142,12 +143,13 @@ def measure_fit(problem: Problem, curvature: LossCurvature) -> Fit:
         judged.append(compare(cells_of(residual / np.sqrt(noise), lattice), random))
         own = compare(cells_of(residual * np.sqrt(weight), lattice), random)
         energy += own.energy
+        total += float(np.sum(weight * residual**2))
         size += float(np.sum(weight * view.kept(true) ** 2))
         # The variance has the right pattern, and its size is that of most residuals.
         ratio = float(np.mean(np.minimum(residual**2 / noise, MOST_RATIO)))
         residuals.append(Residual(slopes[number], weight**2 * ratio * noise * correlated))
     # Any of the views may show the misfit.
-    return Fit(min(min(each.p for each in judged) * len(judged), 1.0), energy, size, residuals)
+    return Fit(min(min(each.p for each in judged) * len(judged), 1.0), energy, total, size, residuals)
 
 
 def _noise(images: Array, target: Array) -> Array:
