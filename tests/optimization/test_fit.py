@@ -4,6 +4,7 @@ of a model that is right or wrong.
 
 from __future__ import annotations
 
+import types
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from scipy.ndimage import gaussian_filter
 
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
-from reslrb_cli.optimization.uncertainty import candidates, fit
+from reslrb_cli.optimization.uncertainty import candidates, fit, measuring
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.records.measurements import MISFIT
 
@@ -91,6 +92,14 @@ def test_offsets_of_textures_explain_a_part():
     assert len(part.candidates) == 1
     for energy in (4.0, 5.0):
         assert found.without(energy) == fit.FitRecord(0.002, 0.0, 0.0, False, [])
+
+
+def test_an_error_does_not_lose_the_verdicts(caplog):
+    certainty = object.__new__(measuring.Certainty)
+    certainty.problem = types.SimpleNamespace()
+    with caplog.at_level("WARNING"):
+        assert certainty._test_fit(types.SimpleNamespace(first=None), lambda: True) is None
+    assert "the fit of the model was not tested: " in caplog.text
 
 
 def linear(random: Random, known: int, planted: float) -> tuple[candidates._Tests, np.ndarray]:

@@ -26,6 +26,7 @@ from reslrb_cli.optimization.uncertainty.fit import Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
+from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import Proposal, propose
 from reslrb_cli.statistics import Array, rms, special
@@ -135,6 +136,8 @@ def _unrecovered(problem: Problem) -> list[Proposal]:
         info = each.info
         is_large = len(info.shape) != 3 and int(np.prod(info.shape)) > SMALL
         if info.key in problem.selection.scene_keys or info.bits is not None or is_large or info.value is None:
+            continue
+        if bends_light(params, info.key):  # a step would move the light out of the picture
             continue
         low, high = open_domain(params, info.key)
         if low <= info.value.low and info.value.high <= high:  # others would be moved, such as weights of 0

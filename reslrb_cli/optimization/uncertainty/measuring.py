@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import numpy as np
 
+from reslrb_cli.errors import describe
 from reslrb_cli.optimization.identifiability import shown_texels
 from reslrb_cli.optimization.nonfinite import fill_gaps
 from reslrb_cli.optimization.problem import Problem
@@ -24,7 +26,7 @@ from reslrb_cli.optimization.uncertainty.curvature import (
     plan_changes,
     row_of,
 )
-from reslrb_cli.optimization.uncertainty.fit import measure_fit
+from reslrb_cli.optimization.uncertainty.fit import FitRecord, measure_fit
 from reslrb_cli.optimization.uncertainty.posterior import Measured
 from reslrb_cli.optimization.uncertainty.verdicts import (
     CertaintyRecord,
@@ -37,6 +39,8 @@ from reslrb_cli.records.clock import StepClock
 from reslrb_cli.records.tree import to_array
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.statistics import Array, rms
+
+logger = logging.getLogger(__name__)
 
 _PURPOSE = "certainty"
 
@@ -114,8 +118,6 @@ class Certainty:
         """
         if iterations < LEAST_ITERATIONS:
             return None
-        from reslrb_cli.optimization.uncertainty.candidates import judge_fit  # late, because it imports SciPy
-
         problem, config, clock, compiled_ms = self.problem, self.problem.config, StepClock(), 0.0
         try:
             problem.apply()
@@ -145,10 +147,10 @@ class Certainty:
             weighed = found.weighed(measured)
             go_on = _Budget(max(SHARE_OF_FIT * elapsed_s, LEAST_SECONDS_OF_FIT), stop)
             with clock.step() as times:
-                fit = judge_fit(problem, measure_fit(problem, found.first), found.first, go_on)
+                fit = self._test_fit(found, go_on)
             compiled_ms += times.codegen_ms
-            fit = fit.without(found.energy_of_textures(weighed))
-            if fit.is_significant:
+            fit = fit and fit.without(found.energy_of_textures(weighed))
+            if fit is not None and fit.is_significant:
                 wider, widest = (found.with_misfit(factor**2 * fit.energy).weighed(measured) for factor in (1, HIDDEN))
                 weighed = with_misfit(weighed, wider, widest)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
@@ -167,6 +169,16 @@ class Certainty:
         finally:
             take_gradient(problem)
             problem.apply()
+
+    def _test_fit(self, found: Curvatures, go_on: _Budget) -> FitRecord | None:
+        """Test whether the model fits the targets. An error does not lose the verdicts: the result is then None."""
+        from reslrb_cli.optimization.uncertainty.candidates import judge_fit  # late, because it imports SciPy
+
+        try:
+            return judge_fit(self.problem, measure_fit(self.problem, found.first), found.first, go_on)
+        except Exception as error:
+            logger.warning(f"the fit of the model was not tested: {describe(error)}")
+            return None
 
     def _target_noise(self) -> str:
         """Return `target_noise` of `CertaintyRecord`, which states whether the spreads include the targets' noise."""
