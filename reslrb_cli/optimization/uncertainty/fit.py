@@ -200,17 +200,17 @@ def _sums(cells: Array, side: int) -> Array:
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """Probability that noise looks like a residual, and the energy of the residual's common part."""
+class Coherence:
+    """Probability that noise looks like a residual, and the energy of the part that neighbouring pixels share."""
 
     p: float
     energy: float
 
 
-def compare(cells: Array, random: np.random.Generator) -> Comparison:
+def compare(cells: Array, random: np.random.Generator) -> Coherence:
     """Compare the residual (h, w, N) with noise."""
     if min(cells.shape[:2]) < 2 or not np.any(cells):
-        return Comparison(1.0, 0.0)
+        return Coherence(1.0, 0.0)
     found = _products(cells)
     at_once = max(MOST_AT_ONCE // cells.size, 1)
     signs = random.choice([-1.0, 1.0], size=(FLIPS, *cells.shape[:2], 1))
@@ -219,7 +219,7 @@ def compare(cells: Array, random: np.random.Generator) -> Comparison:
     z = found / spread
     p = (1 + int(np.sum((noise / spread).max(axis=1) >= z.max()))) / (FLIPS + 1)
     energies = found / _pairs(cells.shape[:2])
-    return Comparison(p, float(np.where(z > LEAST_ENERGY, energies, 0.0).max()))
+    return Coherence(p, float(np.where(z > LEAST_ENERGY, energies, 0.0).max()))
 
 
 def _scales(shape: Sequence[int]) -> list[int]:
