@@ -21,6 +21,7 @@ from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.uncertainty import candidates, fit, measuring
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
 from reslrb_cli.records.measurements import MISFIT
+from reslrb_cli.statistics import pseudo_inverse
 
 Random = np.random.Generator
 NOISE: dict[str, Callable[[Random, tuple[int, ...]], np.ndarray]] = {
@@ -52,9 +53,29 @@ def test_a_constant_misfit_is_found(kind: str):
         noise[:8, 8:16] += noise.std()
         found.append(fit.compare(fit.cells_of(noise, 1), random))
     assert np.mean([each.p <= candidates.LEVEL for each in found]) >= 0.9
-    noise = 0.1 * random.normal(size=(24, 24, 3))
-    noise[:8, 8:16] += 0.5
-    assert fit.compare(fit.cells_of(noise, 1), random).energy == pytest.approx(8 * 8 * 3 * 0.25, rel=0.1)
+
+
+@pytest.mark.parametrize(("side", "lattice"), [(24, 1), (25, 1), (200, 1), (210, 3)])
+def test_the_energy_is_that_of_the_misfit(side: int, lattice: int):
+    """It does not depend on the size of the image, or on the lattice."""
+    random, third = np.random.default_rng(6), side // 3
+    noise = 0.1 * random.normal(size=(side, side, 3))
+    noise[:third, third : 2 * third] += 0.5
+    found = fit.compare(fit.cells_of(noise, lattice), random).energy
+    assert found == pytest.approx(third * third * 3 * 0.25, rel=0.12)
+
+
+@pytest.mark.parametrize("shape", [(2, 2, 3), (4, 40, 3), (1, 1, 1)])
+def test_images_without_cells_show_no_misfit(shape: tuple[int, ...]):
+    assert fit.compare(fit.cells_of(np.ones(shape), 8), np.random.default_rng(0)).p == 1.0
+
+
+def test_directions_of_other_units_are_not_left_out():
+    matrix, scale = np.array([[2.0, 0.5], [0.5, 1.0]]), np.diag([1.0, 1e-6])
+    found = pseudo_inverse(scale @ matrix @ scale, 1e-3)
+    np.testing.assert_allclose(scale @ found @ scale, np.linalg.inv(matrix))
+    assert not pseudo_inverse(np.zeros((2, 2)), 1e-3).any()
+    assert pseudo_inverse(np.ones((2, 2)), 1e-3) == pytest.approx(np.full((2, 2), 0.25))
 
 
 def test_the_filter_of_the_film_correlates_no_cells(llvm):
@@ -82,7 +103,6 @@ def test_correlations_of_filters(name: str, right: list[float], llvm):
 
 def test_large_images_have_few_cells():
     assert fit.cells_of(np.ones((300, 500, 3)), 3).shape == (34, 56, 27)
-    assert fit.compare(np.ones((1, 1, 3)), np.random.default_rng(0)).p == 1.0
 
 
 def test_offsets_of_textures_explain_a_part():

@@ -12,6 +12,7 @@ noise of channels that are fully correlated.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ import numpy as np
 import yaml
 
 from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.errors import describe
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
@@ -29,12 +31,13 @@ from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import Proposal, propose
-from reslrb_cli.statistics import Array, rms, special
+from reslrb_cli.statistics import Array, pseudo_inverse, rms, special
+
+logger = logging.getLogger(__name__)
 
 #: Step of the differences, as a share of a parameter's scale.
 STEP = 0.1
-#: Largest `p` of residuals, or of a parameter, with which the model does not fit. Largest `p` of parameters that are
-#: then named.
+#: Largest `p` of residuals with which the model does not fit, and largest `p` of parameters that are then named.
 LEVEL, LEVEL_OF_NAMED = 0.004, 0.01
 #: Smallest explained share of a parameter that is named.
 LEAST_EXPLAINED = 0.1
@@ -52,22 +55,25 @@ def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[
 
     `known` has measured the recovered directions. The test of further parameters ends when `go_on` returns false.
     """
-    # Noise may hide a curvature, but no parameter removes more than the residuals.
-    found = [(min(fall, 0.5 * fit.total), p, each) for fall, p, each in _find_candidates(problem, fit, known, go_on)]
-    p = min([fit.p, *(own for _, own, _ in found)])
-    is_significant = p <= LEVEL
-    named = [each for each in found if is_significant and each[1] <= LEVEL_OF_NAMED]
+    if fit.p > LEVEL:
+        return FitRecord(fit.p, 0.0, 0.0, False, [])
+    try:
+        found = [] if known.biases else _find_candidates(problem, fit, known, go_on)
+    except Exception as error:
+        logger.warning(f"no parameters were tested that would reduce the misfit: {describe(error)}")
+        found = []
+    named = [each for each in found if each[1] <= LEVEL_OF_NAMED]
     energy = max(fit.energy, *(2 * fall for fall, *_ in named), 0.0)
     candidates = [replace(each, explained=min(2 * fall / max(energy, 1e-300), 1.0)) for fall, _, each in named]
     kept = [each for each in candidates if each.explained >= LEAST_EXPLAINED][:MOST_RECORDED]
-    misfit = (energy / max(fit.size, 1e-300)) ** 0.5
-    return FitRecord(p, misfit, energy, is_significant, kept)
+    misfit = (energy / fit.size) ** 0.5 if fit.size > 0 else 0.0
+    return FitRecord(fit.p, misfit, energy, True, kept)
 
 
 def _find_candidates(
     problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
 ) -> list[tuple[float, float, Candidate]]:
-    """Return the further parameters, each after the fall of the loss and its `p`, in the order of the falls."""
+    """Return the further parameters, each after the fall of the loss and its `p`. Significant ones come first."""
     proposals = {each.info.key: each for each in _unrecovered(problem)}
     specs = [ParameterSpec(key=key, bounds=None if each.bounds is None else yaml.safe_load(each.bounds))
              for key, each in proposals.items()]  # fmt: skip
@@ -90,8 +96,8 @@ def _find_candidates(
             found = _test(others, fit, known.slopes, curvature, directions, proposals, count)
             # More samples decide on the parameters with the largest effects.
             named = {each.key for _, _, each in found[:MOST_MEASURED_AGAIN]}
-            sure = {each.key: share for each, share in zip(directions, curvature.sure, strict=True)}
-            if spp >= most or all(sure[key] >= LEAST_SURE for key in named):
+            sure = [share for each, share in zip(directions, curvature.sure, strict=True) if each.key in named]
+            if spp >= most or min(sure, default=1.0) >= LEAST_SURE:
                 break
             spp, round = min(spp * MORE, most), round + 1
             changes = [change for change in changes if named & set(change.values)]
@@ -109,24 +115,26 @@ def _test(
     proposals: Mapping[str, Proposal],
     count: int,
 ) -> list[tuple[float, float, Candidate]]:
-    """Return the tested parameters, each after the fall of the loss and its `p`, in the order of the falls. `count` is
+    """Return the tested parameters, each after the fall of the loss and its `p`. Significant ones come first, and
+    larger falls. `count` is
     the number of parameters that were tested at first.
     """
     if not directions:
         return []
     slope = curvature.thinned * curvature.in_a_row([each.slope for each in fit.residuals])
     variance = curvature.thinned**2 * curvature.in_a_row([each.variance for each in fit.residuals])
-    all_channels = fit.residuals[0].slope.shape[2]
+    all_channels = max(each.slope.shape[2] for each in fit.residuals)
     channels = np.array([1.0 if each.channel is not None else all_channels for each in directions])
     tests = _Tests(known, curvature.slopes, curvature.weights, slope, variance, channels)
     found = []
     for key in dict.fromkeys(direction.key for direction in directions):
         places = [place for place, direction in enumerate(directions) if direction.key == key]
         fall, p, offset = tests.of(places)
-        p = min(p * count, 1.0)
+        # Noise may hide a curvature, but no parameter removes more than the residuals.
+        fall, p = min(fall, 0.5 * fit.total), min(p * count, 1.0)
         own = [directions[each] for each in places]
         found.append((fall, p, _candidate(problem, proposals[key], own, offset, p)))
-    return sorted(found, key=lambda each: -each[0])
+    return sorted(found, key=lambda each: (each[1] > LEVEL_OF_NAMED, -each[0]))
 
 
 def _unrecovered(problem: Problem) -> list[Proposal]:
@@ -169,7 +177,7 @@ def _candidate(
     low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
     if directions[0].entry is None:
         low, high = 0.0, np.inf
-    is_inside = bool(np.all((low < proposed) & (proposed < high)))
+    is_inside = bool(np.all((low < proposed) & (proposed < high) & (proposed * value >= 0)))
     return Candidate(key, p, 0.0, value.tolist(), proposed.tolist() if is_inside else [], proposal.bounds or "")
 
 
@@ -192,7 +200,7 @@ class _Tests:
         halves, self.H = [new[0] * inverse, new[1]], new[0] @ new[1].T
         if len(known[0]):
             between = 0.5 * (new[0] @ known[1].T + new[1] @ known[0].T)
-            followed = between @ np.linalg.pinv(positive(known[0] @ known[1].T), rcond=LEAST_EIGENVALUE, hermitian=True)
+            followed = between @ pseudo_inverse(positive(known[0] @ known[1].T), LEAST_EIGENVALUE)
             others = followed @ (0.5 * (known[0] * inverse + known[1]))
             halves = [half - others for half in halves]
             self.H = self.H - followed @ between.T
@@ -209,7 +217,7 @@ class _Tests:
     def of(self, places: Sequence[int]) -> tuple[float, float, Array]:
         """Return the fall of the loss, the probability that noise causes it, and the offsets of the directions."""
         s, at = self.s[places], np.ix_(places, places)
-        inverse = np.linalg.pinv(self.H[at], rcond=LEAST_EIGENVALUE, hermitian=True)
-        z2 = float(s @ np.linalg.pinv(self.V[at], rcond=1e-9, hermitian=True) @ s)
+        inverse = pseudo_inverse(self.H[at], LEAST_EIGENVALUE)
+        z2 = float(s @ pseudo_inverse(self.V[at], 1e-9) @ s)
         p = float(special().chdtrc(len(places), z2))
         return 0.5 * float(s @ inverse @ s), p, np.asarray(-inverse @ s)

@@ -52,7 +52,7 @@ from reslrb_cli.optimization.uncertainty.noise import (
 )
 from reslrb_cli.optimization.uncertainty.posterior import positive
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array, scale_frequencies
+from reslrb_cli.statistics import Array, pseudo_inverse, scale_frequencies
 
 #: Parts of keys of textures that mix channels into one number.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
@@ -243,6 +243,7 @@ class LossCurvature:
         self.sure = np.zeros(0)
         #: Derivatives (M, N) of all pixels along each direction, by each set of samples. The first set has the weights.
         self.slopes: tuple[Array, Array] = np.zeros((0, 0)), np.zeros((0, 0))
+        self.directions: list[ParameterDirection] = []
         #: Samples of the targets' noise by view; empty if no target was rendered.
         self.noises = target_noises(problem, spp) if of_target else []
         #: Two samples of the mean effect that the noise of a step's images has on dL/dI (H, W, C), by view; empty if
@@ -289,7 +290,7 @@ class LossCurvature:
             return [], np.zeros((0, 0)), np.zeros((0, 0))
         a, b = (np.array(rows) for rows in columns)
         a = a * self.weights
-        self.slopes = a, b
+        self.slopes, self.directions = (a, b), directions
         self.sure = _sure_share(a * b)
         sure = np.sqrt(np.outer(self.sure, self.sure))
         H = _symmetric(a @ b.T * sure) + self._of_regularizers(directions)
@@ -412,21 +413,27 @@ class LossCurvature:
         """The weights (N,) in the first set of `slopes`."""
         return self.in_a_row(self._weights) * self.thinned
 
-    def removed(self, slopes: Sequence[Array]) -> list[Array]:
-        """Return the change of each view's image (H, W, C) that a Newton step along the measured directions would
-        remove. `slopes` are dL/dI. Values that are not used are 0.
+    def newton_change(self, slopes: Sequence[Array]) -> list[Array]:
+        """Return the change of each view's image (H, W, C) by a Newton step along the directions of `along`, within the
+        bounds. `slopes` are dL/dI of the views.
         """
         a, b = self.slopes
-        weights = self.weights
-        change = np.zeros(len(weights))
-        if len(a):
-            J = 0.5 * (a / np.where(weights > 0, weights, np.inf) + b)
-            inverse = np.linalg.pinv(positive(a @ b.T), rcond=LEAST_STEP, hermitian=True)
-            change = (inverse @ (J @ (self.thinned * self.in_a_row(slopes)))) @ J
-        flat = np.zeros(sum(image.size for image in slopes))
-        flat[slice(None) if self._picked is None else self._picked] = change
-        parts = np.split(flat, np.cumsum([image.size for image in slopes])[:-1])
-        return [part.reshape(image.shape) for part, image in zip(parts, slopes, strict=True)]
+        if not len(a):
+            return [np.zeros_like(image) for image in slopes]
+        weights, problem = self.weights, self.problem
+        J = 0.5 * (a / np.where(weights > 0, weights, np.inf) + b)
+        step = pseudo_inverse(positive(a @ b.T), LEAST_STEP) @ (J @ (self.thinned * self.in_a_row(slopes)))
+        values = {each.key: problem.selection.array(each.key).astype(np.float64) for each in self.directions}
+        for each, size in zip(self.directions, step, strict=True):
+            if each.entry is not None:
+                values[each.key].ravel()[each.entry] -= size
+            else:
+                values[each.key][..., slice(None) if each.channel is None else each.channel] *= 1 - size
+        for key, value in values.items():
+            low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
+            values[key] = np.clip(value, low, high)
+        one, other = self._derivatives(ParameterChange(values, 1.0, self.directions))
+        return [0.5 * (up + down) for up, down in zip(one, other, strict=True)]
 
     def in_a_row(self, images: Sequence[Array]) -> Array:
         """Return the used values (N,) of images of all views (H, W, C)."""

@@ -20,7 +20,7 @@ to be as large as the one that is left.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -37,8 +37,8 @@ from reslrb_cli.seeds import seed
 from reslrb_cli.statistics import Array
 
 PURPOSE = "fit"
-#: Images of the final values, each with the samples of a step, and the least samples of all together.
-IMAGES, LEAST_SPP = 8, 64
+#: Images of the final values, each with the samples of a step, their least number, and the least samples of all.
+IMAGES, LEAST_IMAGES, LEAST_SPP = 8, 4, 64
 #: Side in pixels of the mean of the noise's variance.
 SMOOTHED = 5
 #: Deviation of a pixel, as a share of the target, that counts as much as noise of the same size.
@@ -74,10 +74,9 @@ class Candidate(Jsonable):
 
 @dataclass(frozen=True)
 class FitRecord(Jsonable):
-    """Whether the model fits the targets. `p` is the probability that noise looks like the residuals or, if it is
-    smaller, like the effect of any of the tested parameters. `misfit` is the root mean square of the misfit over the
-    images, as a share of the target's. `energy` is twice the loss of the misfit. `candidates` are parameters that would
-    reduce the misfit, the most effective one first.
+    """Whether the model fits the targets. `p` is the probability that noise looks like the residuals. `misfit` is the
+    root mean square of the misfit over the images, as a share of the target's. `energy` is twice the loss of the
+    misfit. `candidates` are parameters that would reduce the misfit, the most effective one first.
     """
 
     p: float
@@ -119,45 +118,60 @@ class Fit:
     residuals: list[Residual]
 
 
-def measure_fit(problem: Problem, curvature: LossCurvature) -> Fit:
+def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], bool]) -> Fit:
     """Test the images of the current values against the targets of all training views.
 
     `curvature` has measured the recovered directions. The parameters may still be on their way to the optimum. The part
-    of the residual that their movement would remove is subtracted.
+    of the residual that a Newton step would remove is subtracted. Rendering ends early if `go_on` returns false.
     """
-    spp = problem.config.run.spp
-    count = max(IMAGES, -(-LEAST_SPP // spp))
-    images = [see_images(problem, spp, -each, PURPOSE) for each in range(count)]
-    random = np.random.default_rng(seed(problem.config.run.seed, 0, 0, PURPOSE))
-    judged, energy, total, size = [], 0.0, 0.0, 0.0
-    residuals: list[Residual] = []
-    means = [np.array(samples, dtype=np.float64).mean(axis=0) for samples in zip(*images, strict=True)]
+    means, variances = _mean_images(problem, go_on)
     slopes = [finite(slope(view.judge, mean)) * view.share for view, mean in zip(problem.trained, means, strict=True)]
-    removed = curvature.removed(slopes)
-    for number, (view, samples) in enumerate(zip(problem.trained, zip(*images, strict=True), strict=True)):
-        known, true = np.array(samples, dtype=np.float64), np.array(view.target, dtype=np.float64)
-        mean = means[number]
-        residual = finite(view.kept(mean - true)) - removed[number]
+    random = np.random.default_rng(seed(problem.config.run.seed, 0, 0, PURPOSE))
+    changes, judged, energy, total, size = curvature.newton_change(slopes), [], 0.0, 0.0, 0.0
+    residuals: list[Residual] = []
+    for number, view in enumerate(problem.trained):
+        true, mean = np.array(view.target, dtype=np.float64), means[number]
+        residual = view.kept(finite(mean - true) + changes[number])
         lattice, correlated = lattice_of(problem, view)
-        noise, weight = _noise(known, true), second_derivative(view, mean)
+        noise, weight = _noise(variances[number], true), second_derivative(view, mean)
+        if curvature.biases:  # a kink, as that of `l1`, has a derivative that says nothing about single pixels
+            weight = np.where(weight > 0, weight.mean(), view.kept(np.full(weight.shape, weight.mean())))
         judged.append(compare(cells_of(residual / np.sqrt(noise), lattice), random))
-        own = compare(cells_of(residual * np.sqrt(weight), lattice), random)
-        energy += own.energy
+        energy += compare(cells_of(residual * np.sqrt(weight), lattice), random).energy
         total += float(np.sum(weight * residual**2))
         size += float(np.sum(weight * view.kept(true) ** 2))
         # The variance has the right pattern, and its size is that of most residuals.
-        ratio = float(np.mean(np.minimum(residual**2 / noise, MOST_RATIO)))
+        ratios = np.minimum(residual**2 / noise, MOST_RATIO)[residual != 0]
+        ratio = float(ratios.mean()) if ratios.size else 0.0
         residuals.append(Residual(slopes[number], weight**2 * ratio * noise * correlated))
     # Any of the views may show the misfit.
-    return Fit(min(min(each.p for each in judged) * len(judged), 1.0), energy, total, size, residuals)
+    largest = np.max([each.noise for each in judged], axis=0)
+    p = (1 + int(np.sum(largest >= max(each.z for each in judged)))) / (FLIPS + 1)
+    return Fit(p, min(energy, total), total, size, residuals)
 
 
-def _noise(images: Array, target: Array) -> Array:
-    """Return the variance (H, W, C) of the residual for the decision, from several images (K, H, W, C)."""
+def _mean_images(problem: Problem, go_on: Callable[[], bool]) -> tuple[list[Array], list[Array]]:
+    """Return the mean image of each view (H, W, C), and the variance of its noise."""
+    spp, count = problem.config.run.spp, 0
+    sums, squares = ([np.zeros(view.target.shape) for view in problem.trained] for _ in range(2))
+    for number in range(max(IMAGES, -(-LEAST_SPP // spp))):
+        if number >= LEAST_IMAGES and not go_on():
+            break
+        images = [np.asarray(image, dtype=np.float64) for image in see_images(problem, spp, -number, PURPOSE)]
+        sums = [a + b for a, b in zip(sums, images, strict=True)]
+        squares = [a + b**2 for a, b in zip(squares, images, strict=True)]
+        count += 1
+    means = [each / count for each in sums]
+    pairs = zip(means, squares, strict=True)
+    return means, [np.maximum(square / count - mean**2, 0.0) / (count - 1) for mean, square in pairs]
+
+
+def _noise(variance: Array, target: Array) -> Array:
+    """Return the variance (H, W, C) of the residual for the decision, from that of an image."""
     from scipy.ndimage import uniform_filter  # imported here, because only the end of a run needs it
 
-    variance = finite(images.var(axis=0, ddof=1)) / len(images)
-    smooth = np.stack([uniform_filter(each, SMOOTHED, mode="nearest") for each in np.moveaxis(variance, 2, 0)], axis=2)
+    bands = np.moveaxis(finite(variance), 2, 0)
+    smooth = np.stack([uniform_filter(each, SMOOTHED, mode="nearest") for each in bands], axis=2)
     size = float(np.mean(target**2))
     return np.asarray(smooth + (FLOOR * target) ** 2 + 1e-6 * size + 1e-30)
 
@@ -167,7 +181,7 @@ def lattice_of(problem: Problem, view: View) -> tuple[int, float]:
     correlations with all pixels.
     """
     own = correlations(problem.scene.sensors()[view.sensor].film().rfilter())
-    lattice = 1 + int(np.max(np.nonzero(own >= UNCORRELATED)[0]))
+    lattice = 1 + int(np.max(np.nonzero(np.abs(own) >= UNCORRELATED)[0]))
     is_compressed = view.file is not None and view.file.suffix.lower() in COMPRESSED_FILES
     return max(lattice, COMPRESSED) if is_compressed else lattice, float(2 * own.sum() - own[0]) ** 2
 
@@ -185,12 +199,16 @@ def correlations(rfilter: mi.ReconstructionFilter) -> Array:
 
 def cells_of(image: Array, lattice: int) -> Array:
     """Return the components (h, w, N) of an image (H, W, C) in cells. Pixels beyond the last whole cell are left out.
-    Large images have the sums over several cells.
+    Large images have the sums over several cells,
+    divided by the side of their square, so that a constant residual keeps its sum of squares.
     """
     height, width = (size // lattice for size in image.shape[:2])
+    if not height or not width:
+        return np.zeros((1, 1, 1))
     cut = image[: height * lattice, : width * lattice]
     cells = cut.reshape(height, lattice, width, lattice, -1).swapaxes(1, 2).reshape(height, width, -1)
-    return _sums(cells, -(-max(height, width, 1) // MOST_CELLS))
+    side = -(-max(height, width) // MOST_CELLS)
+    return _sums(cells, side) / side
 
 
 def _sums(cells: Array, side: int) -> Array:
@@ -201,25 +219,31 @@ def _sums(cells: Array, side: int) -> Array:
 
 @dataclass(frozen=True)
 class Coherence:
-    """Probability that noise looks like a residual, and the energy of the part that neighbouring pixels share."""
+    """The largest Q of a residual in standard deviations `z`, those of its random signs `noise` (FLIPS,), and the
+    energy of the part that neighbouring pixels share.
+    """
 
-    p: float
+    z: float
+    noise: Array
     energy: float
+
+    @property
+    def p(self) -> float:
+        """The probability that noise looks like the residual."""
+        return (1 + int(np.sum(self.noise >= self.z))) / (FLIPS + 1)
 
 
 def compare(cells: Array, random: np.random.Generator) -> Coherence:
     """Compare the residual (h, w, N) with noise."""
     if min(cells.shape[:2]) < 2 or not np.any(cells):
-        return Coherence(1.0, 0.0)
+        return Coherence(-np.inf, np.full(FLIPS, -np.inf), 0.0)
     found = _products(cells)
     at_once = max(MOST_AT_ONCE // cells.size, 1)
     signs = random.choice([-1.0, 1.0], size=(FLIPS, *cells.shape[:2], 1))
     noise = np.concatenate([_products(cells * signs[first : first + at_once]) for first in range(0, FLIPS, at_once)])
     spread = np.maximum(noise.std(axis=0), 1e-300)
-    z = found / spread
-    p = (1 + int(np.sum((noise / spread).max(axis=1) >= z.max()))) / (FLIPS + 1)
-    energies = found / _pairs(cells.shape[:2])
-    return Coherence(p, float(np.where(z > LEAST_ENERGY, energies, 0.0).max()))
+    z, energies = found / spread, found / _pairs(cells.shape[:2])
+    return Coherence(z.max(), (noise / spread).max(axis=1), float(np.where(z > LEAST_ENERGY, energies, 0.0).max()))
 
 
 def _scales(shape: Sequence[int]) -> list[int]:

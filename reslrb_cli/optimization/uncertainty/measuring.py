@@ -175,7 +175,8 @@ class Certainty:
         from reslrb_cli.optimization.uncertainty.candidates import judge_fit  # late, because it imports SciPy
 
         try:
-            return judge_fit(self.problem, measure_fit(self.problem, found.first), found.first, go_on)
+            fit = measure_fit(self.problem, found.first, go_on)
+            return judge_fit(self.problem, fit, found.first, go_on)
         except Exception as error:
             logger.warning(f"the fit of the model was not tested: {describe(error)}")
             return None
@@ -290,12 +291,12 @@ class Curvatures:
         """Return twice the loss of the offsets that large parameters still have. Their entries are not among the
         directions of the test of fit.
         """
-        spreads = {key: (weighed[key].spread or [None])[0] for key in self.by_entry}
-        entries = {direction.key for direction in self.directions if direction.entry is not None}
-        return sum(
-            spread**2 * float(np.maximum(self.by_entry[key].diagonal, 0.0).sum())
-            for key, spread in spreads.items() if spread is not None and key not in entries
-        )  # fmt: skip
+        entries, total = {each.key for each in self.directions if each.entry is not None}, 0.0
+        for key in set(self.by_entry) - entries:
+            parts = [(part or [None])[0] for part in (weighed[key].to_go, weighed[key].of_target)]
+            squares = sum(part**2 for part in parts if part is not None)
+            total += squares * float(np.maximum(self.by_entry[key].diagonal, 0.0).sum())
+        return total
 
     def with_misfit(self, energy: float) -> Curvatures:
         """Return the curvatures with a misfit of this energy (`fit.py`) in B and in its diagonal by entry. The offset
