@@ -160,7 +160,7 @@ def test_without_chromium_the_tests_say_so_in_one_line(
     monkeypatch.setattr(common, "find_chromium", lambda: None)
     said, left_out = [], []
     hook = SimpleNamespace(pytest_deselected=lambda items: left_out.extend(items))
-    items = [SimpleNamespace(fixturenames=names, path="a") for names in (("chromium", "pages"), ())]
+    items = [SimpleNamespace(fixturenames=names, path=Path("a")) for names in (("chromium", "pages"), ())]
     common.pytest_collection_modifyitems(SimpleNamespace(hook=hook, getoption=lambda name: (1, 1)), items)
     assert (len(items), len(left_out)) == (1, 1)
     common.pytest_terminal_summary(SimpleNamespace(write_line=said.append))

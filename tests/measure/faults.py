@@ -150,7 +150,7 @@ def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
     """
     module, _, path = fault.where.partition(":")
     function = attrgetter(path)(importlib.import_module(f"reslrb_cli.{module}"))
-    function = getattr(function, "__func__", function)
+    function = getattr(function, "__func__", getattr(function, "fget", function))
     source = textwrap.dedent(inspect.getsource(function))
     assert source.count(fault.right) == 1, f"{fault.where} has no such line any more: {fault.right}"
     # Annotations name types that are imported only for type checkers.
@@ -158,7 +158,8 @@ def plant(fault: Fault, monkeypatch: pytest.MonkeyPatch) -> None:
     scope = dict(function.__globals__)
     exec(compile(broken_source, fault.where, "exec", dont_inherit=True), scope)
     broken = scope[function.__name__]
-    monkeypatch.setattr(function, "__code__", getattr(broken, "__func__", broken).__code__)
+    broken = getattr(broken, "__func__", getattr(broken, "fget", broken))
+    monkeypatch.setattr(function, "__code__", broken.__code__)
 
 
 def assert_found(fault: Fault, monkeypatch: pytest.MonkeyPatch, holds: Callable[[], object]) -> None:
