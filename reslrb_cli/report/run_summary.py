@@ -40,11 +40,8 @@ LOWER, MORE_SAMPLES = 3, 16
 #: The proposal for which a run continues; the others need a new run.
 LONGER = "more iterations"
 
-#: The proposal to render the target with more samples.
-CLEANER, UNBIASED = "a cleaner target", "a loss without bias"
-
-#: The proposal to recover a parameter that would explain the misfit of the model.
-RECOVER = "another parameter"
+#: Proposals: a target with more samples, another loss, and a further parameter, which would explain a misfit.
+CLEANER, UNBIASED, RECOVER = "a cleaner target", "a loss without bias", "another parameter"
 
 #: Proposals in the order of priority: the first ones make the later ones useless.
 ORDER = ("a limit", "a lower rate", RECOVER, "a higher rate", "a new run from here", LONGER, UNBIASED, CLEANER)
