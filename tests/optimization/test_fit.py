@@ -19,7 +19,8 @@ from scipy.ndimage import gaussian_filter
 from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.uncertainty import candidates, fit, measuring
-from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection
+from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, ParameterCertainty, with_misfit
 from reslrb_cli.records.measurements import MISFIT
 from reslrb_cli.statistics import pseudo_inverse
 
@@ -120,6 +121,35 @@ def test_an_error_does_not_lose_the_verdicts(caplog):
     with caplog.at_level("WARNING"):
         assert certainty._test_fit(types.SimpleNamespace(first=None), lambda: True) is None
     assert "the fit of the model was not tested: " in caplog.text
+
+
+@pytest.mark.parametrize(("error", "value"), [(0.05, 0.45), (-0.3, 0.6)])
+def test_a_newton_step_goes_to_the_optimum_within_the_bounds(error: float, value: float):
+    changes, J, weight = [], np.ones((1, 4)), 2.0
+    curvature = object.__new__(LossCurvature)
+    curvature.slopes, curvature.thinned, curvature._picked = (J * weight, J), 1.0, None
+    curvature._weights = [np.full((2, 2, 1), weight)]
+    curvature.directions = [ParameterDirection("p", np.ones(1), None, 0)]
+    settings = {"p": types.SimpleNamespace(bounds=(0.0, 0.6))}
+    selection = types.SimpleNamespace(array=lambda key: np.array([0.5]), specs=settings)
+    curvature.problem = types.SimpleNamespace(selection=selection)
+    curvature._derivatives = lambda change: (changes.append(change), [[np.ones((2, 2, 1))], [np.zeros((2, 2, 1))]])[1]
+    found = curvature.newton_change([np.full((2, 2, 1), weight * error)])
+    np.testing.assert_allclose(changes[0].values["p"], [value])
+    np.testing.assert_array_equal(found, np.full((1, 2, 2, 1), 0.5))
+
+
+def test_a_misfit_unsettles_what_a_larger_one_would():
+    def about(verdict: str, spread: float) -> ParameterCertainty:
+        return ParameterCertainty(verdict, {verdict: 1.0}, [spread], [0.0])
+
+    found = {key: about(verdict, 0.1) for key, verdict in (("a", "settled"), ("b", "settled"), ("c", "still moving"))}
+    wider = {key: about(each.verdict, 0.2) for key, each in found.items()}
+    widest = wider | {"b": about("below the noise", 0.4)}
+    judged = with_misfit(found, wider, widest)
+    assert {key: each.verdict for key, each in judged.items()} == {"a": "settled", "b": MISFIT, "c": "still moving"}
+    assert judged["b"].shares == {MISFIT: 1.0}
+    assert all(each.spread == [0.2] for each in judged.values())
 
 
 def linear(random: Random, known: int, planted: float) -> tuple[candidates._Tests, np.ndarray]:
