@@ -152,16 +152,17 @@ def test_a_misfit_unsettles_what_a_larger_one_would():
     assert all(each.spread == [0.2] for each in judged.values())
 
 
-def linear(random: Random, known: int, planted: float) -> tuple[candidates._Tests, np.ndarray]:
+def linear(random: Random, known: int, planted: float, moving: float = 0.0) -> tuple[candidates._Tests, np.ndarray]:
     """Return the tests of two further parameters of a linear model after its `known` parameters were recovered. The
-    first one is wrong by `planted`. Return also the derivatives of its images.
+    first one is wrong by `planted`, and the first recovered one still moves by `moving`. Return also the derivatives of
+    its images.
     """
     size = 600
     J = random.normal(size=(known + 2, size))
     J[known] += 0.5 * J[0]  # a recovered parameter makes up for a part
     weights, noise = np.full(size, 2.0), 0.3
     residual = planted * J[known] + noise * random.normal(size=size)
-    residual = residual - J[:known].T @ np.linalg.lstsq(J[:known].T, residual, rcond=None)[0]
+    residual = residual - J[:known].T @ np.linalg.lstsq(J[:known].T, residual, rcond=None)[0] + moving * J[0]
     halves = [J + 0.05 * random.normal(size=J.shape) for _ in range(2)]
     a, b = halves[0] * weights, halves[1]
     variance = weights**2 * noise**2
@@ -182,6 +183,26 @@ def test_the_wrong_parameter_is_found(known: int):
     left = J[known] - (others.T @ np.linalg.lstsq(others.T, J[known], rcond=None)[0] if known else 0)
     assert fall == pytest.approx(0.5 * 2 * 0.2**2 * left @ left, rel=0.3)
     assert tests.of([1])[1] > 1e-3
+
+
+def test_values_on_their_way_show_no_further_parameter():
+    assert linear(np.random.default_rng(7), 3, 0.0, 0.3)[0].of([0])[1] > 1e-3
+
+
+@pytest.mark.parametrize(("name", "file", "right"), [
+    ("box", None, 1), ("gaussian", "a.exr", 3), ("mitchell", None, 3), ("gaussian", "a.JPG", 8),
+])  # fmt: skip
+def test_pixels_that_are_compared(name: str, file: str | None, right: int, llvm):
+    film = types.SimpleNamespace(rfilter=lambda: mi.load_dict({"type": name}))
+    scene = types.SimpleNamespace(sensors=lambda: [types.SimpleNamespace(film=lambda: film)])
+    view = types.SimpleNamespace(sensor=0, file=file and Path(file))
+    assert fit.lattice_of(types.SimpleNamespace(scene=scene), view)[0] == right
+
+
+def test_a_model_that_fits_is_tested_no_further():
+    """Neither scene nor curvature is needed."""
+    found = candidates.judge_fit(None, fit.Fit(0.01, 1.0, 1.0, 1.0, []), None, lambda: True)
+    assert (found.p, found.is_significant, found.candidates) == (0.01, False, [])
 
 
 def test_noise_shows_no_further_parameter():
