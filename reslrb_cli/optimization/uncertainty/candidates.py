@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 #: Step of the differences, as a share of a parameter's scale.
 STEP = 0.1
 #: Largest `p` of residuals with which the model does not fit, and largest `p` of parameters that are then named.
-LEVEL, LEVEL_OF_NAMED = 0.004, 0.01
+LEVEL, LEVEL_OF_NAMED = 0.01, 0.01
 #: Smallest explained share of a parameter that is named.
 LEAST_EXPLAINED = 0.1
 #: Smallest eigenvalue of a curvature that counts, as a share of its largest.
