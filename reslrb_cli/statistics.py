@@ -42,16 +42,6 @@ def isotonic_regression() -> Any:
     return scipy.optimize.isotonic_regression
 
 
-def pseudo_inverse(matrix: Array, least: float) -> Array:
-    """Return the inverse of a positive matrix (N, N). Directions whose eigenvalues are below the share `least` of the
-    largest one are left out, for a matrix that is scaled to a diagonal of 1. Rows of zeros have the inverse 0.
-    """
-    root = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    scale = np.where(root > 0, 1 / np.where(root > 0, root, 1.0), 0.0)
-    both = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(matrix * both, rcond=least, hermitian=True) * both)
-
-
 def rms(values: Array) -> float:
     """Return the root mean square of all entries, in double precision."""
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

@@ -159,7 +159,7 @@ def choose_sensors(config: Config, scene: mi.Scene) -> list[int]:
 
 
 def read_sensor_ids(config: Config) -> list[str]:
-    """Return the ids of the scene's sensors, in its files without building the scene. Raises ConfigError."""
+    """Return the ids of the scene's sensors. The scene is not built, unless it is in memory. Raises ConfigError."""
     scene = config.scene
     if scene.file.name == IN_MEMORY:
         return [sensor.id() for sensor in _lent_scene(config, [], []).sensors()]

@@ -19,7 +19,7 @@ from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import INCOMPLETE, MISFIT, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
-from reslrb_cli.report.misfit import candidates_of, misfit_lines, misfit_words, spec_of
+from reslrb_cli.report.spread import first_spec, misfit_lines, misfit_words, noise_line, spread_words
 
 #: Recorded verdicts on a value: SETTLED is reliable, and the others give the reason why a value is not.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
@@ -178,8 +178,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         return Remedy(UNBIASED, "--set loss.type=l2")
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return _samples(MORE_SAMPLES * measured["target_spp"])
-    if about.get("verdict") == MISFIT and (named := candidates_of(results)):
-        return Remedy(RECOVER, spec_of(named[0]))
+    if about.get("verdict") == MISFIT and (spec := first_spec(results)):
+        return Remedy(RECOVER, spec)
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
     if about.get("verdict") != MOVING or moved is None or not iterations:
         return None
@@ -196,18 +196,6 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         return Remedy("a new run from here", "initial: {run: RUN} for each parameter")
     longer = min(max(way / moved if moved else MOST_LONGER, LEAST_LONGER), MOST_LONGER)
     return _iterations(int(float(f"{longer * iterations:.2g}")))
-
-
-def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
-    """Return one standard deviation, for each entry of a small parameter or for a typical entry of a large parameter.
-    The result is empty if unknown.
-    """
-    spread = _about(results, key).get("spread")
-    if not spread:
-        return ""
-    if all(value == spread[0] for value in spread):
-        return f"{sign} {number(spread[0], 2)}"
-    return f"{sign} " + " ".join("-" if value is None else number(value, 2) for value in spread)
 
 
 def certainty_lines(results: Mapping[str, Any]) -> list[str]:
@@ -231,15 +219,6 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
         line += f" ({best.words}: {best.setting})" if best is not None and best.words in own else ""
         lines.append(line)
     return lines
-
-
-def noise_line(results: Mapping[str, Any]) -> str:
-    """Return a line that says that the spreads exclude the target's noise. The result is empty if they include it."""
-    measured = results.get("certainty") or {}
-    if measured.get("target_noise") not in ("left out", "in part"):
-        return ""
-    which = "" if measured["target_noise"] == "left out" else " that are files"
-    return f"spread: by the noise of the run; noise and errors of targets{which} are not in it"
 
 
 def _source(results: Mapping[str, Any]) -> str:

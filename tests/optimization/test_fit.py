@@ -20,9 +20,9 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.uncertainty import candidates, fit, measuring
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection
+from reslrb_cli.optimization.uncertainty.posterior import pseudo_inverse
 from reslrb_cli.optimization.uncertainty.verdicts import CertaintyRecord, ParameterCertainty, with_misfit
 from reslrb_cli.records.measurements import MISFIT
-from reslrb_cli.statistics import pseudo_inverse
 
 Random = np.random.Generator
 NOISE: dict[str, Callable[[Random, tuple[int, ...]], np.ndarray]] = {
@@ -163,8 +163,7 @@ def linear(random: Random, known: int, planted: float, moving: float = 0.0) -> t
     weights, noise = np.full(size, 2.0), 0.3
     residual = planted * J[known] + noise * random.normal(size=size)
     residual = residual - J[:known].T @ np.linalg.lstsq(J[:known].T, residual, rcond=None)[0] + moving * J[0]
-    halves = [J + 0.05 * random.normal(size=J.shape) for _ in range(2)]
-    a, b = halves[0] * weights, halves[1]
+    a, b = (J + 0.05 * random.normal(size=J.shape) for _ in range(2))
     variance = weights**2 * noise**2
     tests = candidates._Tests(
         (a[:known], b[:known]), (a[known:], b[known:]), weights, weights * residual, variance, np.ones(2)
@@ -201,7 +200,7 @@ def test_pixels_that_are_compared(name: str, file: str | None, right: int, llvm)
 
 def test_a_model_that_fits_is_tested_no_further():
     """Neither scene nor curvature is needed."""
-    found = candidates.judge_fit(None, fit.Fit(0.02, 1.0, 1.0, 1.0, []), None, lambda: True)
+    found = candidates.judge_fit(None, fit.Fit(0.02, 1.0, 1.0, 1.0, [], []), None, lambda: True)
     assert (found.p, found.is_significant, found.candidates) == (0.02, False, [])
 
 

@@ -248,14 +248,14 @@ def test_a_model_that_does_not_fit_names_what_would():
     lines = parameter_lines(found, 120)
     assert lines[1].endswith(f"{MISFIT}: another parameter")
     assert lines[2:] == [
-        "misfit: images and targets differ by 6.1 % more than by noise; the spreads include as large a misfit that the "
-        "values may hide",
+        "misfit: images and targets differ by 6.1 % more than noise explains; the spreads allow for a hidden misfit of "
+        "the same size",
         "these entries of `parameters` would reduce it:",
         "  - {key: ball.alpha, bounds: [0.02, 1]}  # 98 % of the misfit; 0.2 would become about 0.491",
         "  - {key: rug.data}  # 31 % of the misfit",
     ]
     assert warnings(found) == [
-        f"{MISFIT}: lamp.radiance.value (images and targets differ by 6.1 % more than by noise) "
+        f"{MISFIT}: lamp.radiance.value (images and targets differ by 6.1 % more than noise explains) "
         "(another parameter: - {key: ball.alpha, bounds: [0.02, 1]})"
     ]
     assert yaml.safe_load(lines[4]) == [{"key": "ball.alpha", "bounds": [0.02, 1]}]

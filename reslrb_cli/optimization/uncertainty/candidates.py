@@ -1,12 +1,12 @@
 """Parameters that the run does not recover, and that would reduce the misfit of the model (Rao's score test).
 
-For the change of an image j along a direction of such a parameter, by differences of images at common random numbers,
-and dL/dI at the final values, the loss has the derivative s = sum over pixels of j dL/dI. The recovered parameters
-would follow: the part of j that they can cause is subtracted, with H between both. If the parameter was recovered too,
-the loss would fall by about s^2 / (2 h), where h is the curvature that remains. The directions of a parameter are taken
-together.
+The derivative j of the image along a direction of such a parameter comes from differences of images at common random
+numbers. The derivative of the loss is s, the sum of j dL/dI over the pixels, at the final values. The recovered
+parameters would follow the new one. The part of j that they can also cause is therefore subtracted first. If the new
+parameter was recovered too, the loss would fall by about s^2 / (2 h). Here h is the curvature that remains. All
+directions of a parameter are tested together.
 
-The noise of s follows from the noise of the residual (`fit.Residual`). Directions that change all channels have the
+The noise of s follows from the noise of the residual (`fit.Fit`). Directions that change all channels have the
 noise of channels that are fully correlated.
 """
 
@@ -25,13 +25,13 @@ from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
 from reslrb_cli.optimization.uncertainty.fit import Candidate, Fit, FitRecord
-from reslrb_cli.optimization.uncertainty.posterior import positive
+from reslrb_cli.optimization.uncertainty.posterior import positive, pseudo_inverse
 from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import Proposal, propose
-from reslrb_cli.statistics import Array, pseudo_inverse, rms, special
+from reslrb_cli.statistics import Array, rms, special
 
 logger = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def _find_candidates(
             count = count or len({direction.key for direction in directions})
             if len(directions) < sum(len(change.directions) for change in changes) and found:
                 break  # the time is up, and the earlier measurement is complete
-            found = _test(others, fit, known.slopes, curvature, directions, proposals, count)
+            found = _test(others, fit, known.derivatives, curvature, directions, proposals, count)
             # More samples decide on the parameters with the largest effects.
             named = {each.key for _, _, each in found[:MOST_MEASURED_AGAIN]}
             sure = [share for each, share in zip(directions, curvature.sure, strict=True) if each.key in named]
@@ -115,17 +115,16 @@ def _test(
     proposals: Mapping[str, Proposal],
     count: int,
 ) -> list[tuple[float, float, Candidate]]:
-    """Return the tested parameters, each after the fall of the loss and its `p`. Significant ones come first, and
-    larger falls. `count` is
-    the number of parameters that were tested at first.
+    """Return the tested parameters, each after the fall of the loss and its `p`. Significant ones come first, and among
+    them larger falls. `count` is the number of parameters in the first round of tests.
     """
     if not directions:
         return []
-    slope = curvature.thinned * curvature.in_a_row([each.slope for each in fit.residuals])
-    variance = curvature.thinned**2 * curvature.in_a_row([each.variance for each in fit.residuals])
-    all_channels = max(each.slope.shape[2] for each in fit.residuals)
+    slope = curvature.thinned * curvature.in_a_row(fit.slopes)
+    variance = curvature.thinned**2 * curvature.in_a_row(fit.variances)
+    all_channels = max(each.shape[2] for each in fit.slopes)
     channels = np.array([1.0 if each.channel is not None else all_channels for each in directions])
-    tests = _Tests(known, curvature.slopes, curvature.weights, slope, variance, channels)
+    tests = _Tests(known, curvature.derivatives, curvature.weights, slope, variance, channels)
     found = []
     for key in dict.fromkeys(direction.key for direction in directions):
         places = [place for place, direction in enumerate(directions) if direction.key == key]
@@ -157,16 +156,14 @@ def _unrecovered(problem: Problem) -> list[Proposal]:
 def scale_of(problem: Problem, proposal: Proposal) -> float:
     """Return the scale of a parameter: its value, or half the distance between its bounds, if that is larger."""
     key = proposal.info.key
-    sizes = [rms(problem.selection.array(key))]
-    low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
-    if np.isfinite(high - low):
-        sizes.append(0.5 * (high - low))
-    return max(sizes) or 1.0
+    low, high = problem.selection.specs[key].bounds or (0.0, 0.0)
+    return max(rms(problem.selection.array(key)), 0.5 * (high - low) if np.isfinite(high - low) else 0.0) or 1.0
 
 
 def _candidate(
     problem: Problem, proposal: Proposal, directions: Sequence[ParameterDirection], offset: Array, p: float
 ) -> Candidate:
+    """Return the record of a parameter whose directions would change by `offset`."""
     key = proposal.info.key
     value = problem.selection.array(key).astype(np.float64).ravel()
     if directions[0].entry is None:
@@ -174,17 +171,16 @@ def _candidate(
     else:
         proposed = value.copy()
         proposed[[direction.entry for direction in directions]] += offset
-    low, high = problem.selection.specs[key].bounds or (-np.inf, np.inf)
-    if directions[0].entry is None:
-        low, high = 0.0, np.inf
+    bounds = problem.selection.specs[key].bounds if directions[0].entry is not None else (0.0, np.inf)
+    low, high = bounds or (-np.inf, np.inf)
     is_inside = bool(np.all((low < proposed) & (proposed < high) & (proposed * value >= 0)))
     return Candidate(key, p, 0.0, value.tolist(), proposed.tolist() if is_inside else [], proposal.bounds or "")
 
 
 class _Tests:
-    """Score tests of directions. `known` and `new` are the derivatives of N values of the images along directions, by
-    two sets of samples. The first sets have the weights (N,). `slope` and `variance` (N,) are dL/dI and its noise.
-    `channels` (M,) is the number of channels that each new direction changes.
+    """Score tests of directions. `known` and `new` are the derivatives of N values of the images along directions, each
+    by two sets of samples. `weights` (N,) are d2L/dI2. `slope` and `variance` (N,) are dL/dI and its noise. `channels`
+    (M,) is the number of channels that each new direction changes.
     """
 
     def __init__(
@@ -196,17 +192,17 @@ class _Tests:
         variance: Array,
         channels: Array,
     ) -> None:
-        inverse = np.where(weights > 0, 1 / np.where(weights > 0, weights, 1.0), 0.0)
-        halves, self.H = [new[0] * inverse, new[1]], new[0] @ new[1].T
+        halves, products = list(new), new[0] * weights * new[1]
+        self.H = (new[0] * weights) @ new[1].T
         if len(known[0]):
-            between = 0.5 * (new[0] @ known[1].T + new[1] @ known[0].T)
-            followed = between @ pseudo_inverse(positive(known[0] @ known[1].T), LEAST_EIGENVALUE)
-            others = followed @ (0.5 * (known[0] * inverse + known[1]))
+            between = 0.5 * ((new[0] * weights) @ known[1].T + (new[1] * weights) @ known[0].T)
+            followed = between @ pseudo_inverse((known[0] * weights) @ known[1].T, LEAST_EIGENVALUE)
+            others = followed @ (0.5 * (known[0] + known[1]))
             halves = [half - others for half in halves]
             self.H = self.H - followed @ between.T
         # At least a standard error: where noise hides the curvature, the fall would have no limit.
         self.H = positive(self.H)
-        error = np.sqrt(np.sum((new[0] * new[1]) ** 2, axis=1))
+        error = np.sqrt(np.sum(products**2, axis=1))
         self.H += np.diag(np.maximum(error - np.diag(self.H), 0.0))
         s = [half @ slope for half in halves]
         self.s = 0.5 * (s[0] + s[1])

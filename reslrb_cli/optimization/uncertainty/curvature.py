@@ -50,9 +50,9 @@ from reslrb_cli.optimization.uncertainty.noise import (
     second_derivative,
     target_noises,
 )
-from reslrb_cli.optimization.uncertainty.posterior import positive
+from reslrb_cli.optimization.uncertainty.posterior import pseudo_inverse
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array, pseudo_inverse, scale_frequencies
+from reslrb_cli.statistics import Array, scale_frequencies
 
 #: Parts of keys of textures that mix channels into one number.
 MIXING = ("alpha", "roughness", "weight", "opacity", "normalmap", "bump", "metallic", "anisotropic")
@@ -413,16 +413,21 @@ class LossCurvature:
         """The weights (N,) in the first set of `slopes`."""
         return self.in_a_row(self._weights) * self.thinned
 
+    @property
+    def derivatives(self) -> tuple[Array, Array]:
+        """The derivatives of `slopes`, both without the weights. In the first set, values without weight are 0."""
+        (a, b), weights = self.slopes, self.weights
+        return (a / np.where(weights > 0, weights, np.inf) if len(a) else a), b
+
     def newton_change(self, slopes: Sequence[Array]) -> list[Array]:
-        """Return the change of each view's image (H, W, C) by a Newton step along the directions of `along`, within the
-        bounds. `slopes` are dL/dI of the views.
+        """Return the change of each view's image (H, W, C) that a Newton step along the directions of `along` makes.
+        The step ends at the bounds. `slopes` are dL/dI of the views.
         """
         a, b = self.slopes
         if not len(a):
             return [np.zeros_like(image) for image in slopes]
-        weights, problem = self.weights, self.problem
-        J = 0.5 * (a / np.where(weights > 0, weights, np.inf) + b)
-        step = pseudo_inverse(positive(a @ b.T), LEAST_STEP) @ (J @ (self.thinned * self.in_a_row(slopes)))
+        problem, J = self.problem, 0.5 * sum(self.derivatives)
+        step = pseudo_inverse(a @ b.T, LEAST_STEP) @ (J @ (self.thinned * self.in_a_row(slopes)))
         values = {each.key: problem.selection.array(each.key).astype(np.float64) for each in self.directions}
         for each, size in zip(self.directions, step, strict=True):
             if each.entry is not None:

@@ -1,21 +1,20 @@
 """Test of fit: whether noise explains the residual between the images of the final values and the targets.
 
-The noise of a target file is not known. But the noise of pixels far enough apart is independent, whereas an error of
-the model changes neighbouring pixels alike. The test therefore uses products of the residuals of different pixels. A
-pixel and another pixel of one window are compared if their distance is a multiple of a lattice constant, beyond which
-the film's filter does not correlate the noise. With the residual V_c of a cell c, which has a component for each pixel
-and channel,
+The noise of a target file is not known. But distant pixels have independent noise, whereas an error of the model
+changes neighbouring pixels alike. The test therefore uses products of the residuals of different pixels. A cell is a
+square of pixels whose side is the smallest distance at which the film's filter does not correlate the noise. The
+residual V_c of cell c is a vector with a component for each pixel and channel. The sum
 
     Q(s) = sum over windows of s x s cells (|sum V_c|^2 - sum |V_c|^2)
 
 has a mean of 0 for noise. Random signs of the cells give the distribution of all Q(s) for noise with the same second
-moments, whatever its size and its tails. The largest Q(s), in standard deviations, decides.
+moments, whatever its size and its tails. The largest Q(s), in standard deviations, decides. For this decision, each
+pixel has the weight 1 / (noise^2 + (`FLOOR` target)^2).
 
-Each pixel has the weight 1 / (noise^2 + (`FLOOR` target)^2) for the decision. The size of the misfit has the weights of
-the loss. For a misfit that is constant in each window, Q(s) is n (n - 1) / n times the sum of its squares over the n
-cells of each window. The `energy` is this sum for the scale with the largest sum, so that the misfit adds energy / 2 to
-the loss. A misfit that the parameters have made up for is not in it. The misfit that they have made up for is assumed
-to be as large as the one that is left.
+The `energy` of the misfit uses the weights of the loss. If the misfit is constant in windows of n cells, Q(s) is n - 1
+times the sum of its squares over all cells. The energy is the largest of these sums over the scales s. The misfit then
+adds energy / 2 to the loss. The part of a misfit that the parameters have made up for does not show in the residual.
+This part is assumed to be as large as the part that is left.
 """
 
 from __future__ import annotations
@@ -58,10 +57,13 @@ LEAST_ENERGY = 3.0
 
 @dataclass(frozen=True)
 class Candidate(Jsonable):
-    """A parameter that would reduce the misfit: `explained` is the share of the misfit's loss, at most 1. `value` is
-    the present value, and `proposed` the value to which the test points, empty if this is outside of the bounds; a
-    texture has one factor for each channel.
-    `p` is the probability that noise shows any of the tested parameters like this one. `bounds` are YAML, or "".
+    """Parameter that would reduce the misfit.
+
+    - `p` is the probability that noise has as large an effect along any of the tested parameters.
+    - `explained` is the share of the misfit's loss that the parameter removes, at most 1.
+    - `value` is the present value, and `proposed` the value at which the loss would be smallest. `proposed` is empty if
+        that value is outside of the bounds. For a texture, both are one factor for each channel.
+    - `bounds` are YAML, or "".
     """
 
     key: str
@@ -96,26 +98,19 @@ class FitRecord(Jsonable):
 
 
 @dataclass(frozen=True)
-class Residual:
-    """Residual of a view: dL/dI (H, W, C) at the final values, and the variance of its noise (H, W, C). The variance
-    contains a factor for neighbouring pixels, as if all were independent.
-    """
-
-    slope: Array
-    variance: Array
-
-
-@dataclass(frozen=True)
 class Fit:
     """Result of the test of fit. `p` is the probability that noise looks like the residuals. `energy` is twice the loss
-    of the misfit, `total` that of the whole residuals, and `size` that of black images.
+    of the misfit, `total` that of the whole residuals, and `size` that of black images. `slopes` are dL/dI of each view
+    (H, W, C) at the final values, and `variances` their noise. The variances contain a factor for the noise that
+    neighbouring pixels share, so that all pixels may be taken as independent.
     """
 
     p: float
     energy: float
     total: float
     size: float
-    residuals: list[Residual]
+    slopes: list[Array]
+    variances: list[Array]
 
 
 def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], bool]) -> Fit:
@@ -124,18 +119,18 @@ def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], 
     `curvature` has measured the recovered directions. The parameters may still be on their way to the optimum. The part
     of the residual that a Newton step would remove is subtracted. Rendering ends early if `go_on` returns false.
     """
-    means, variances = _mean_images(problem, go_on)
+    means, of_means = _mean_images(problem, go_on)
     slopes = [finite(slope(view.judge, mean)) * view.share for view, mean in zip(problem.trained, means, strict=True)]
     random = np.random.default_rng(seed(problem.config.run.seed, 0, 0, PURPOSE))
     changes, judged, energy, total, size = curvature.newton_change(slopes), [], 0.0, 0.0, 0.0
-    residuals: list[Residual] = []
-    for number, view in enumerate(problem.trained):
-        true, mean = np.array(view.target, dtype=np.float64), means[number]
-        residual = view.kept(finite(mean - true) + changes[number])
+    variances: list[Array] = []
+    for view, mean, change, of_mean in zip(problem.trained, means, changes, of_means, strict=True):
+        true = np.array(view.target, dtype=np.float64)
+        residual = view.kept(finite(mean - true) + change)
         lattice, correlated = lattice_of(problem, view)
-        noise, weight = _noise(variances[number], true), second_derivative(view, mean)
+        noise, weight = _noise(of_mean, true), second_derivative(view, mean)
         if curvature.biases:  # a kink, as that of `l1`, has a derivative that says nothing about single pixels
-            weight = np.where(weight > 0, weight.mean(), view.kept(np.full(weight.shape, weight.mean())))
+            weight = view.kept(np.full_like(weight, weight.mean()))
         judged.append(compare(cells_of(residual / np.sqrt(noise), lattice), random))
         energy += compare(cells_of(residual * np.sqrt(weight), lattice), random).energy
         total += float(np.sum(weight * residual**2))
@@ -143,11 +138,10 @@ def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], 
         # The variance has the right pattern, and its size is that of most residuals.
         ratios = np.minimum(residual**2 / noise, MOST_RATIO)[residual != 0]
         ratio = float(ratios.mean()) if ratios.size else 0.0
-        residuals.append(Residual(slopes[number], weight**2 * ratio * noise * correlated))
+        variances.append(weight**2 * ratio * noise * correlated)
     # Any of the views may show the misfit.
-    largest = np.max([each.noise for each in judged], axis=0)
-    p = (1 + int(np.sum(largest >= max(each.z for each in judged)))) / (FLIPS + 1)
-    return Fit(p, min(energy, total), total, size, residuals)
+    together = Coherence(max(each.z for each in judged), np.max([each.noise for each in judged], axis=0), energy)
+    return Fit(together.p, min(energy, total), total, size, slopes, variances)
 
 
 def _mean_images(problem: Problem, go_on: Callable[[], bool]) -> tuple[list[Array], list[Array]]:
@@ -170,10 +164,8 @@ def _noise(variance: Array, target: Array) -> Array:
     """Return the variance (H, W, C) of the residual for the decision, from that of an image."""
     from scipy.ndimage import uniform_filter  # imported here, because only the end of a run needs it
 
-    bands = np.moveaxis(finite(variance), 2, 0)
-    smooth = np.stack([uniform_filter(each, SMOOTHED, mode="nearest") for each in bands], axis=2)
-    size = float(np.mean(target**2))
-    return np.asarray(smooth + (FLOOR * target) ** 2 + 1e-6 * size + 1e-30)
+    smooth = uniform_filter(finite(variance), (SMOOTHED, SMOOTHED, 1), mode="nearest")
+    return np.asarray(smooth + (FLOOR * target) ** 2 + 1e-6 * np.mean(target**2) + 1e-30)
 
 
 def lattice_of(problem: Problem, view: View) -> tuple[int, float]:
@@ -199,8 +191,8 @@ def correlations(rfilter: mi.ReconstructionFilter) -> Array:
 
 def cells_of(image: Array, lattice: int) -> Array:
     """Return the components (h, w, N) of an image (H, W, C) in cells. Pixels beyond the last whole cell are left out.
-    Large images have the sums over several cells,
-    divided by the side of their square, so that a constant residual keeps its sum of squares.
+    Large images have the sums over squares of cells. They are divided by the side of a square, so that a constant
+    residual keeps its sum of squares.
     """
     height, width = (size // lattice for size in image.shape[:2])
     if not height or not width:
@@ -246,16 +238,13 @@ def compare(cells: Array, random: np.random.Generator) -> Coherence:
     return Coherence(z.max(), (noise / spread).max(axis=1), float(np.where(z > LEAST_ENERGY, energies, 0.0).max()))
 
 
-def _scales(shape: Sequence[int]) -> list[int]:
-    """Return the sides of windows in cells: 2, 4 and so on, to the first one that contains the image."""
-    return [2**power for power in range(1, int(np.ceil(np.log2(max(shape)))) + 1)]
-
-
 def _products(cells: Array) -> Array:
-    """Return Q (..., S) of residuals (..., h, w, N) for each of S sides of windows."""
+    """Return Q (..., S) of residuals (..., h, w, N) for each of S sides of windows: 2, 4 and so on cells, up to the
+    first side that contains the image.
+    """
     own = np.sum(cells**2, axis=(-3, -2, -1))
     found, sums = [], cells
-    for _ in _scales(cells.shape[-3:-1]):
+    for _ in range(int(np.ceil(np.log2(max(cells.shape[-3:-1]))))):
         sums = _sums(sums, 2)
         found.append(np.sum(sums**2, axis=(-3, -2, -1)) - own)
     return np.stack(found, axis=-1)

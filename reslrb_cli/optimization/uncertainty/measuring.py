@@ -293,8 +293,7 @@ class Curvatures:
         """
         entries, total = {each.key for each in self.directions if each.entry is not None}, 0.0
         for key in set(self.by_entry) - entries:
-            parts = [(part or [None])[0] for part in (weighed[key].to_go, weighed[key].of_target)]
-            squares = sum(part**2 for part in parts if part is not None)
+            squares = sum((part[0] or 0.0) ** 2 for part in (weighed[key].to_go, weighed[key].of_target) if part)
             total += squares * float(np.maximum(self.by_entry[key].diagonal, 0.0).sum())
         return total
 

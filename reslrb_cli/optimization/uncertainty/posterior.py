@@ -298,3 +298,14 @@ def positive(matrix: Array) -> Array:
     """Return the nearest symmetric matrix without negative eigenvalues. Noise causes negative eigenvalues."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+def pseudo_inverse(matrix: Array, least: float) -> Array:
+    """Return the inverse of a symmetric matrix (N, N), made `positive`. The matrix is first scaled to a diagonal of 1.
+    Directions with eigenvalues below the share `least` of the largest are left out. Rows of zeros have the inverse 0.
+    """
+    matrix = positive(matrix)
+    root = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    scale = np.where(root > 0, 1 / np.where(root > 0, root, 1.0), 0.0)
+    both = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(matrix * both, rcond=least, hermitian=True) * both)

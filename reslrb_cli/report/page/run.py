@@ -18,13 +18,13 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.records.measurements import incomplete_records
 from reslrb_cli.records.run_folder import FABRICATION_FILE, workshop_file
 from reslrb_cli.report.format import count, number
-from reslrb_cli.report.misfit import misfit_lines
 from reslrb_cli.report.page.images import image_rows, seen_table, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
 from reslrb_cli.report.run_summary import error_line, outcome_of, warnings
 from reslrb_cli.report.sources import ShownRun
+from reslrb_cli.report.spread import misfit_lines
 
 #: Number of first steps left out of medians, because they compile kernels.
 WARM_UP = 5

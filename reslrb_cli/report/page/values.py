@@ -14,8 +14,9 @@ from reslrb_cli.report.page.images import show
 from reslrb_cli.report.page.layout import diagram, key, lay_out, soft
 from reslrb_cli.report.panels import ITERATION, TIME
 from reslrb_cli.report.plots import COLORS, Curve, Panel, points_together
-from reslrb_cli.report.run_summary import MOMENTS, is_settled, spread_words, units_differ, verdict_words
+from reslrb_cli.report.run_summary import MOMENTS, is_settled, units_differ, verdict_words
 from reslrb_cli.report.sources import ShownRun
+from reslrb_cli.report.spread import spread_words
 from reslrb_cli.report.tonemap import encode, exposure_for, exposure_words
 
 Array = np.ndarray[Any, Any]
