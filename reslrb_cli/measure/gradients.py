@@ -11,8 +11,9 @@ steps therefore give the truncation error of the smaller step (Richardson 1911).
 
 Paths that change discontinuously cause noise that grows as h shrinks. The noise appears as variation of D(r h) - D(h)
 between seeds. If light moves, rounding errors of the scene can be equal for all seeds. If a change does not shrink with
-h, the change is not truncation, and counts in full. The step with the smallest sum of errors is chosen, and its
-truncation error is stored.
+h, the change is not truncation, and counts in full. Rounding errors of the scene, and waves of a BSDF's tables, are
+equal for all seeds and grow as h shrinks, at most as 1 / h. A change by a shorter step therefore bounds them for the
+longer step. The step with the smallest sum of errors is chosen, and its error that seeds do not show is stored.
 """
 
 from __future__ import annotations
@@ -134,8 +135,8 @@ PLANNED_SEEDS = 16
 class Direction:
     """A direction in the space of all parameters (P,), in the parameters' own units.
 
-    `sides` is as in `Case.difference`. `step` is a fraction of `vector`. `truncation` bounds the absolute error due to
-    the step, in units of the difference.
+    `sides` is as in `Case.difference`. `step` is a fraction of `vector`. `truncation` bounds the absolute error that is
+    equal for all seeds, in units of the difference.
     """
 
     vector: np.ndarray
@@ -196,12 +197,16 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
         for step in STEPS
     }
     best, least, before = direction, np.inf, np.inf
-    for larger, smaller in pairwise(STEPS):
+    for number, (larger, smaller) in enumerate(pairwise(STEPS)):
         change = samples[larger] - samples[smaller]
         spread = float(change.std(ddof=1))
         changed = abs(float(change.mean())) + spread / np.sqrt(len(seeds))
         # Truncation shrinks at least as fast as h, even at kinks.
         truncation = changed / ((larger / smaller) ** 2 - 1) if changed <= before * smaller / larger else changed
+        for shorter in STEPS[number + 2 :][:1]:
+            further = samples[smaller] - samples[shorter]
+            certain = abs(float(further.mean())) - float(further.std(ddof=1)) / np.sqrt(len(seeds))
+            truncation += max(certain, 0.0) * shorter / smaller
         before = changed
         error = truncation + spread / np.sqrt(PLANNED_SEEDS)
         if error < least:

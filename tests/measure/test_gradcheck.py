@@ -403,6 +403,8 @@ def test_a_step_lost_in_rounding_is_not_used():
     [first] = directions(Case(room(), ["side.brdf_0.reflectance.value"]), "side.brdf_0.reflectance.value", (0, 1), 1)
     chosen = choose_step(Rounded(), None, first, (1, 2, 3), 64)  # type: ignore[arg-type]
     assert chosen.step == 0.01
+    error = Rounded().difference(None, None, 4, 64, chosen.step, "both") - 1
+    assert 0.8 * error < chosen.truncation < 2 * error
 
 
 def test_directions_stay_within_the_bounds():
