@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -17,11 +18,12 @@ from reslrb_cli.estimators.stack import StackState
 from reslrb_cli.integrators import reslrb
 from reslrb_cli.integrators.protocol import Job
 from reslrb_cli.measure.gradients import integrator, seeds
-from reslrb_cli.measure.scenes.small import load, room, transform
+from reslrb_cli.measure.scenes.small import load, rectangle, room, transform
 from reslrb_cli.scene.edges import SPHERE, _edges_of, edge_normal, welded_edges
 from reslrb_cli.scene.rays import is_hidden, ray_offset
-from reslrb_cli.transport.bsdf import Hit, reflect_or_refract
-from reslrb_cli.transport.chains import EVENTS, SensorChains
+from reslrb_cli.transport import jumps
+from reslrb_cli.transport.bsdf import Hit, Specular, reflect_or_refract
+from reslrb_cli.transport.chains import EVENTS, Chain, Chains, SensorChains, Target
 from reslrb_cli.transport.edges import sample_outline, view_from_lamps, view_from_sensor
 from reslrb_cli.transport.samples import Samples
 
@@ -272,6 +274,43 @@ def test_the_outline_of_a_lamp_in_a_moved_mirror():
     tracer = integrator("reslrb", 3, estimator="stack", edges="on", paths="camera")
     found = [moving.gradient(tracer, seed, 64)["shape.y"][0] for seed in seeds(4)]
     assert np.mean(found) == pytest.approx(3 * 4 * width**2 * (-2 / distance) * speed, rel=0.03)
+
+
+class OverMirror(Chains):
+    """Chains from a pinhole over the mirror in the plane y = 0. There is no light."""
+
+    cells, has_targets, passes_lamps, most = (4, 4), False, False, 1  # type: ignore[assignment]
+
+    def begin(self, u: mi.Point2f) -> tuple[mi.Ray3f, mi.Spectrum]:
+        way = dr.normalize(mi.Vector3f(0.4 * (u.x / 4 - 0.5), 1, 0.4 * (u.y / 4 - 0.5)))
+        return mi.Ray3f(mi.Point3f(0, -4, 0), way), mi.Spectrum(1)
+
+    def event(self, chain: Chain, active: mi.Bool) -> tuple[Hit, Specular]:
+        d, passes = chain.ray.d, active & (chain.count == 0) & chain.pi.is_valid()
+        return chain.vertex(active), Specular(mi.Vector3f(d.x, -d.y, d.z), mi.Spectrum(1), mi.Float(0), passes)
+
+    def target(self, hit: Hit, count: mi.UInt32, active: mi.Bool) -> Target:
+        return dr.zeros(Target)
+
+
+@pytest.mark.parametrize("scale", [0.8, 200])
+def test_a_curve_in_which_two_surfaces_intersect_is_no_edge(scale: float):
+    """A mirror shows two sheets that intersect. If they are large, their outlines are out of view, and the only jumps
+    are at the curve of the intersection.
+    """
+    sheets = {str(angle): rectangle({"type": "diffuse"}, transform(translate=[0.1, -8, 0.2],
+                                                                  rotate=([1, 0.2, 0], angle), scale=scale))
+              for angle in (-75, -105)}  # fmt: skip
+    scene = load({"type": "scene", "mirror": rectangle({"type": "conductor"}, rotate=([1, 0, 0], 90)), **sheets})
+    needs = SimpleNamespace(has_instances=False)
+    samples: Any = SimpleNamespace(seed=mi.UInt32(3), scene=scene, plan=SimpleNamespace(has_edges=False, needs=needs))
+    number, count, cells = dr.arange(mi.UInt32, 512), dr.opaque(mi.UInt32, 512), dr.opaque(mi.Float, 1, 16)
+    chains = OverMirror(samples, mi.sample_tea_32(number, samples.seed)[0])
+    line = jumps.random_lines(chains, dr.cumsum(cells), number, count)
+    found, edge = (np.array(each) for each in (jumps.random_interval(chains, line).differs,
+                                               jumps.sample_edge(chains, line).active))  # fmt: skip
+    assert found.sum() > 10
+    assert edge.any() == (scale < 1)
 
 
 def test_edges_whose_chain_ends_early_do_not_count(monkeypatch: pytest.MonkeyPatch):
