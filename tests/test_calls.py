@@ -95,7 +95,9 @@ workshop.allowed_errors({}, "lens", {}), workshop.allowed_errors(errors_of(0.9, 
 workshop.allowed_errors(errors_of(0.9, 0.89), "mirror", dict(turn=0.2, index=0.001)), workshop.allowed_errors(errors_of(0.9, 0.95), "lens", dict(turn=1.0, index=0.005))
 [workshop.picture_within(np.pad(np.ones((2, 3)), ((1, 2), (3, 1)))), workshop._unit(np.array([0.0, -2, 2]))]
 workshop.figures(CHECKS, CHECKS.T + 0.1), workshop.as_picture(CHECKS, CHECKS + 1, (slice(1, 7), slice(0, 8)))
+workshop.as_picture(CHECKS, np.pad(CHECKS[1:7], 1, constant_values=5)[:, 1:-1], (slice(1, 7), slice(0, 8)))
 workshop.shift_between(np.roll(SPOT, (2, -3), (0, 1)), SPOT)
+workshop.shift_between(np.exp(-((np.indices((16, 16)) - [[[7.3]], [[5.4]]]) ** 2).sum(0) / 4), SPOT)
 [workshop.beam(POINTS, directions, 2.0) for directions in (towards(5.0), towards(5000.0), towards(900.0))]
 [inspect._counted(counts) for counts in ({}, {"A": 2, "B": 1})]
 [inspect._value(info(value, shape)) for value, shape in ((V([1.5], 1.5, 1, 2), ()), (V([1, 2], 1, 1, 2), (2,)), (V(None, 1, 0, 3), (4, 5, 3)), (V(None, 1, 0, 3), (4, 5, 1)), (V(None, 1, 0, 3), (7, 3)), (None, ()), (None, (3,)))]
@@ -158,6 +160,7 @@ deformation._corners(mi.Point2f([0, 0.3, 1], [0.5, 0.9, 1]), 4, 3)
 deformation.Motion((1, 2, 3), {"x": "a", "rotation": "r", "scale": "s"}).matrix({"a": mi.Float(2), "r": mi.Vector3f(10, 20, 30), "s": mi.Float(2)}).matrix
 deformation.Motion((1, 2, 3), {"rotation_y": "r"}).matrix({"r": mi.Float(10)}, scaled=False).matrix
 HORIZON.holds(mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1])), HORIZON.holds(mi.ScalarBoundingBox3f([-1, -1, -1], [1, 1, 1.1]))
+[values._channels(MESH, key, value, False) for key, value in (("a.vertex_color", dr.zeros(mi.Float, 12)), ("a.face_color", dr.zeros(mi.Float, 6)), ("a.face_w", dr.zeros(mi.Float, 2)), ("a.radii", dr.zeros(mi.Float, 6)), ("a.vertex_x", mi.Color3f(1)))]
 [catalog._current_value(params_of(value), "k") for value in (mi.Float(1, 2, 3, 4), mi.Float(1, 2, 3, 4, 5), mi.Float(2), dr.zeros(mi.Float, 0))]
 [sweeps.SweepRunRecord("a", {}, 0, status).is_done for status in ("finished", "interrupted", "running", "failed", "waiting")]
 [terminal_line(is_terminal) for is_terminal in (True, False)]
@@ -175,6 +178,7 @@ jobs._PROGRESS.match("3/40: loss") is not None, jobs._PROGRESS.match("loss 3/4: 
 CHECKS = np.indices((8, 8)).sum(0) % 3 + 0.5
 SPOT = np.exp(-((np.indices((16, 16)) - 7.0) ** 2).sum(0) / 4)
 POINTS = np.stack([*np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4)), np.zeros((4, 4))], -1).reshape(-1, 3)
+MESH = SimpleNamespace(vertex_count=lambda: 4, face_count=lambda: 2)
 HORIZON = deformation.Horizon((0.0, 0.0, 0.0), 3**0.5)
 
 
@@ -365,7 +369,7 @@ def terminal_line(is_terminal: bool) -> list[bytes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(terminal.os, "isatty", lambda number: is_terminal and number == 2)
         patch.setattr(terminal.os, "write", lambda number, text: written.append(text if number == 2 else b""))
-        patch.setattr(terminal.select, "select", lambda read, write, *_: ([], write, []))
+        patch.setattr(terminal.select, "select", lambda read, write, _, wait=9: ([], [] if wait else write, []))
         terminal._say("interrupted")
     return written
 

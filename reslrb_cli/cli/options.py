@@ -245,7 +245,7 @@ def check_writable(option: str, path: Path | None) -> None:
     """
     if path is None:
         return
-    existed = os.path.lexists(path)
+    existed = os.path.exists(path)
     try:  # O_NONBLOCK, because opening a pipe without a reader would wait forever
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK, 0o666))
     except (OSError, ValueError) as error:
@@ -254,4 +254,4 @@ def check_writable(option: str, path: Path | None) -> None:
             option, "", f"cannot write {path}: {reason or getattr(error, 'strerror', None) or error}"
         ) from None
     if not existed:
-        path.unlink()
+        os.unlink(os.path.realpath(path))  # a link may lead to a file that does not exist

@@ -238,9 +238,9 @@ def _models(file: Path) -> Iterator[tuple[int, tuple[tuple[int, int], float, tup
         except (ValueError, IndexError):
             raise ConfigError(place, "", f"is not a camera: CAMERA_ID, {model}, WIDTH, HEIGHT, parameters") from None
         focal = found.get("f", found.get("fx", 0.0))
-        _check_square(place, "", focal, found.get("fy", focal))
         if not (focal > 0 and math.isfinite(focal) and width > 0 and height > 0):
             raise ConfigError(place, "", "must have a positive focal length and size")
+        _check_square(place, "", focal, found.get("fy", focal))
         yield number, ((width, height), focal, (found["cx"], found["cy"]))
 
 

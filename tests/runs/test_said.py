@@ -95,7 +95,8 @@ def pretend(ends: dict[str, tuple[int, str]], told: list[Any]) -> Any:
             "rmse": {"final": digits[0]},
         }
         status = Status.FINISHED if code == 0 else Status.FAILED
-        content = {"program": PROGRAM, "status": status, "results": results, "error": None if code == 0 else line}
+        content = {"program": PROGRAM, "status": status, "results": results, "error": None if code == 0 else line,
+                   "variant": "a variant", "device": "a device", "seed": 3}  # fmt: skip
         (run / "manifest.json").write_text(json.dumps(content))
         interrupts.requested |= "interrupted" in line
         return code, line
@@ -163,9 +164,10 @@ def test_loggers(name: str, active: bool, status: str, tmp_path: Path, monkeypat
     values = {"a": np.float32([0.1, 0.2, 0.3]), "b": np.float32(2), "c": np.float32(range(5)),
               "slab.heightmap": np.float32([[[1], [3]]]), "d.data": np.full((2, 2, 3), 0.25, np.float32)}  # fmt: skip
     long = {"run.spp": 4, "a(b)": "x" * 7000}
-    for done in (0, 3):
+    others = ((0, "mine"), (3, "other")) if status == "finished" else ()
+    for done, called in ((0, "mine"), (3, "mine"), *others):
         shapes = {key: value.shape for key, value in values.items()}
-        run = RunInfo("mine", tmp_path / "runs/tiny", long, 9, done, shapes, values.__getitem__)
+        run = RunInfo(called, tmp_path / "runs/tiny", long, 9, done, shapes, values.__getitem__)
         logger.begin(run)
         logger.image(run, "target-1", np.full((2, 3, 3), 0.1, np.float32), 2.0)
         logger.iteration(
@@ -173,6 +175,7 @@ def test_loggers(name: str, active: bool, status: str, tmp_path: Path, monkeypat
         )
         logger.image(run, "final", np.full((2, 3, 1), 0.1, np.float32), 1.0)
         logger.end(run, status)
+    logger.end(run, status)  # nothing is logged after the end
     calls = [f"{call[0]} {json.dumps(remembered([call[1], call[2]]))}" for call in fake.mock_calls]
     said.check(f"{name}, {active}, {status}", said.masked([re.sub("x{20,}", lambda m: f"x * {len(m[0])}", each)
                                                         for each in calls], tmp_path))  # fmt: skip

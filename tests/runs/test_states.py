@@ -23,8 +23,9 @@ from cli.test_storms import mount
 from runs.going_on import differences, one_thread, optimize, records_of, state_of
 
 from reslrb_cli.cli import main
+from reslrb_cli.cli import optimize as cli_optimize
 from reslrb_cli.config.loader import load
-from reslrb_cli.errors import ConfigError
+from reslrb_cli.errors import BackendError, ConfigError
 from reslrb_cli.records.checkpoint import read_state, save_checkpoint
 from reslrb_cli.records.lock import FolderLock, Holder
 from reslrb_cli.records.run_folder import RunFolder, read_config, read_value, recovered
@@ -200,6 +201,23 @@ def test_a_loss_of_power_keeps_manifest_and_metrics(run: Path, monkeypatch: pyte
     for n in states:
         assert events[n - 1] == ("flush", "metrics.jsonl")
         assert events[n + 1 : n + 3] == [("rename", "next.npz"), ("flush", "checkpoint")]
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_a_run_continues_with_the_variant_of_its_start(
+    variant: str, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its configuration has `variant: auto`, which now means another one."""
+    rewritten(run, values={"variant": variant})
+    asked: list[str] = []
+
+    def start(config: Any) -> str:
+        asked.append(config.variant)
+        raise BackendError("enough")
+
+    monkeypatch.setattr(cli_optimize, "start_variant", start)
+    assert optimize("--resume", str(run), "--quiet") == 3
+    assert asked == [variant]
 
 
 def test_differences_are_shown(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
