@@ -1,4 +1,4 @@
-"""`reslrb optimize`: recover the parameters of a configuration, or continue a run.
+"""`reslrb optimize`: recover the parameters of a configuration, continue a run, or recover further ones of a run.
 
 `--dry-run` prints the forecast of a run (`show_forecast`). `Progress` shows how far a run is.
 """
@@ -61,10 +61,26 @@ class OptimizeOptions(ExperimentOptions):
     """The options of the command, by the names of its parameters."""
 
     dry_run: bool
+    free: tuple[str, ...]
     resumed: Path | None
     cluster: str | None
     log: tuple[str, ...]
     quiet: bool
+
+    def config(self) -> Config:
+        """Load the configuration, or with `--free` also that of a run, with its values. Raises ConfigError."""
+        path = self.config_file
+        if path is None or not path.is_dir():
+            return super().config()
+        from reslrb_cli.records.manifest import read_content
+        from reslrb_cli.records.run_folder import recovered
+
+        if self.free:
+            return recovered(path, self.overrides).with_code(self.allow_code)
+        if read_content(path) is None:
+            return super().config()
+        reason = f"is the folder of a run; `--resume {path}` continues it, and `{path} --free KEY` starts a new run "
+        raise ConfigError(path, "", f"{reason}from its values, which recovers KEY too")
 
 
 @click.command("optimize")
@@ -73,6 +89,13 @@ class OptimizeOptions(ExperimentOptions):
     "--dry-run",
     is_flag=True,
     help="Measure a few steps, print the memory and time of the iterations, and stop. Writes no run folder.",
+)
+@click.option(
+    "--free",
+    multiple=True,
+    metavar="KEY",
+    help="Recover this parameter of the scene too; `inspect` lists the keys. If CONFIG is the folder of a run, the new "
+    "run starts from the values that it found. May be repeated.",
 )
 @click.option(
     "--resume",
@@ -95,6 +118,8 @@ class OptimizeOptions(ExperimentOptions):
 def command(**given: Any) -> int:
     """Recover the parameters of CONFIG from its target images.
 
+    With --free KEY, CONFIG may also be the folder of a run.
+
     Writes a run folder. The last line of the output names the folder. Ctrl-C, SIGTERM and SIGHUP end the run after the
     current iteration, with a complete folder. A second signal ends the run at once. --resume RUN continues any run that
     has ended.
@@ -108,6 +133,9 @@ def command(**given: Any) -> int:
             raise click.UsageError("--dry-run is for a new run, --resume continues one; give only one of them")
         if options.config_file is not None:
             raise click.UsageError("--resume RUN uses the configuration of the run; leave out CONFIG")
+        if options.free:
+            run = options.resumed
+            raise click.UsageError(f"--free starts a new run, --resume continues one; give `optimize {run} --free KEY`")
         return _resume(options.resumed, options, workers)
     if options.dry_run and workers is not None:
         raise click.UsageError("--dry-run measures only this process; leave out --cluster")
@@ -132,6 +160,10 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Cluster | None)
     if workers is not None:
         workers.check()
     variant = start_variant(config)
+    if options.free:
+        from reslrb_cli.runs.freeing import with_freed
+
+        config = with_freed(config, options.free, "--free")
     callbacks = _callbacks(config, options)
     if options.dry_run:
         show_forecast(config)
@@ -181,7 +213,7 @@ def _run(begun: PreparedRun, workers: Cluster | None, callbacks: list[Callback],
     from reslrb_cli.records.manifest import Status
     from reslrb_cli.records.run_folder import link_latest
     from reslrb_cli.records.sweeps import is_sweep
-    from reslrb_cli.report.run_summary import last_line, parameter_lines, terminal_width
+    from reslrb_cli.report.run_summary import free_command, last_line, parameter_lines, terminal_width
     from reslrb_cli.runs.recorder import Recording
 
     course, manifest = begun.course, begun.manifest
@@ -202,6 +234,8 @@ def _run(begun: PreparedRun, workers: Cluster | None, callbacks: list[Callback],
     echo(last_line(status.value, manifest.results, tallies, os.path.relpath(page if page.exists() else place.path)))
     if not quiet and status is Status.INTERRUPTED:
         echo(f"next: `reslrb optimize --resume {os.path.relpath(place.path)}` continues this run")
+    if not quiet and (command := free_command(manifest.content(), os.path.relpath(place.path))):
+        echo(f"next: `{command}` starts from these values, and recovers what would reduce the misfit too")
     if not quiet and status is Status.FINISHED and course.problem.config.fabrication is not None:
         echo(f"next: `reslrb export {os.path.relpath(place.path)} -o FOLDER` writes the solid")
     return ExitCode.DONE if status is Status.FINISHED else ExitCode.INTERRUPTED

@@ -81,7 +81,7 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
             reason = "has no effect, because the run's recovered value replaces it"
             raise ConfigError(each.label, format_location(each.location), f"{reason}; use `render --value KEY=VALUE`")
     config = read_config(run, parsed)
-    start = RunValue(run=run)
+    start = RunValue(run=Path(os.path.realpath(run)))  # `latest` may lead to another run later
     specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
     return config.model_copy(update={"parameters": specs})
 

@@ -19,7 +19,7 @@ from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import INCOMPLETE, MISFIT, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
-from reslrb_cli.report.spread import first_spec, misfit_lines, misfit_words, noise_line, spread_words
+from reslrb_cli.report.spread import leading_keys, misfit_lines, misfit_words, noise_line, spread_words
 
 #: Recorded verdicts on a value: SETTLED is reliable, and the others give the reason why a value is not.
 SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
@@ -91,14 +91,14 @@ class Remedy(NamedTuple):
         """Return the command that continues or repeats the run in `folder` with this setting. Return the setting alone
         if it belongs into the configuration file.
         """
-        if not self.setting.startswith("--set "):
+        if not self.setting.startswith("--"):
             return self.setting
-        return f"{again(manifest, folder, resumes=self.words == LONGER)} {self.setting}"
+        words = {LONGER: ["--resume", folder], RECOVER: [folder]}.get(self.words, [f"{folder}/config.yaml"])
+        return f"{_optimize(manifest, *words)} {self.setting}"
 
 
-def again(manifest: Mapping[str, Any], folder: str, resumes: bool) -> str:
-    """Return the command that resumes the run in `folder`, or repeats it with its own configuration."""
-    words = ["--resume", folder] if resumes else [f"{folder}/config.yaml"]
+def _optimize(manifest: Mapping[str, Any], *words: str) -> str:
+    """Return the command `reslrb optimize` with these words. It may run the code that the run of `manifest` may run."""
     allowed = ["--allow-code"] if "--allow-code" in (manifest.get("command_line") or ()) else []
     return shlex.join(["reslrb", "optimize", *words, *allowed])
 
@@ -108,7 +108,7 @@ def advice(results: Mapping[str, Any]) -> Remedy | None:
     two proposals may contradict each other.
     """
     found = [find_remedy(results, key) for key in verdicts_of(results)]
-    found += [_cleaner_target(results), _longer(results)]
+    found += [_cleaner_target(results), _longer(results), _recover(results)]
     remedies = [remedy for remedy in found if remedy is not None]
     return min(remedies, key=lambda each: (ORDER.index(each.words), -each.size), default=None)
 
@@ -136,6 +136,20 @@ def _longer(results: Mapping[str, Any]) -> Remedy | None:
     if late == "fell" and not verdicts_of(results) and _loss_fell(results):
         return _iterations(2 * done)
     return None
+
+
+def _recover(results: Mapping[str, Any]) -> Remedy | None:
+    """Return the proposal for a run whose model does not fit, if further parameters would reduce the misfit."""
+    keys = leading_keys(results)
+    return Remedy(RECOVER, " ".join(shlex.join(["--free", key]) for key in keys)) if keys else None
+
+
+def free_command(manifest: Mapping[str, Any], folder: str) -> str:
+    """Return the command that starts from the values of the run in `folder`, and also recovers what would reduce its
+    misfit. The result is empty if the run's proposal is another one.
+    """
+    best = advice(manifest.get("results") or {})
+    return best.command(manifest, folder) if best is not None and best.words == RECOVER else ""
 
 
 def _iterations(count: int) -> Remedy:
@@ -178,8 +192,8 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
         return Remedy(UNBIASED, "--set loss.type=l2")
     if about.get("verdict") == NOISE and _is_of_target(about) and measured.get("target_spp"):
         return _samples(MORE_SAMPLES * measured["target_spp"])
-    if about.get("verdict") == MISFIT and (spec := first_spec(results)):
-        return Remedy(RECOVER, spec)
+    if about.get("verdict") == MISFIT:
+        return _recover(results)
     moved, rate, iterations = about.get("moved"), about.get("rate"), measured.get("iterations")
     if about.get("verdict") != MOVING or moved is None or not iterations:
         return None
@@ -503,7 +517,7 @@ def outcome_of(manifest: Mapping[str, Any], results: Mapping[str, Any], folder: 
         if not done:
             return Outcome(grade, sentence)
         proposal = "Continue it" + (", after you have corrected the error:" if grade == "failed" else ":")
-        return Outcome(grade, sentence, proposal, again(manifest, folder, resumes=True))
+        return Outcome(grade, sentence, proposal, _optimize(manifest, "--resume", folder))
     if _loss_fell(results) is None:
         few = ", too few to judge its result" if done < LEAST_JUDGED else ""
         return Outcome("open", f"The run finished after {count(done, 'iteration')}{few}.")

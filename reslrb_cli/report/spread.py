@@ -10,6 +10,9 @@ from typing import Any
 
 from reslrb_cli.report.format import number
 
+#: Share of a misfit that leaves nothing to explain.
+EXPLAINED = 0.9
+
 
 def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
     """Return one standard deviation, for each entry of a small parameter or for a typical entry of a large parameter.
@@ -42,10 +45,15 @@ def misfit_words(results: Mapping[str, Any]) -> str:
     return f"images and targets differ by {100 * fit['misfit']:.2g} % more than noise explains"
 
 
-def first_spec(results: Mapping[str, Any]) -> str:
-    """Return the entry of `parameters` that would reduce the misfit most. The result is empty without one."""
-    found = _candidates(results)
-    return _spec(found[0]) if found else ""
+def leading_keys(results: Mapping[str, Any]) -> list[str]:
+    """Return the parameters that would reduce the misfit most, and together explain nearly all of it."""
+    found, explained = [], 0.0
+    for each in _candidates(results):
+        if explained >= EXPLAINED:
+            break
+        found.append(str(each["key"]))
+        explained += each["explained"]
+    return found
 
 
 def misfit_lines(results: Mapping[str, Any]) -> list[str]:

@@ -26,6 +26,7 @@ import reslrb_cli as rl
 from reslrb_cli.api import experiment as experiment_module
 from reslrb_cli.errors import ExitCode, MachineError, NonFinite
 from reslrb_cli.optimization import sensitivity
+from reslrb_cli.optimization.uncertainty import measuring
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.runs import recorder as recording
 
@@ -51,8 +52,13 @@ def test_a_loop_ends_with_the_warnings_of_the_run(experiment: Path, caplog: pyte
         break
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert not any("not converged" in line for line in said)
+    assert run.unexplained() is None  # too few iterations
     list(run)
-    warnings = json.loads(Path("runs/a/manifest.json").read_text())["results"]["warnings"]
+    results = json.loads(Path("runs/a/manifest.json").read_text())["results"]
+    warnings, found = results["warnings"], run.unexplained()
+    assert found is not None
+    assert found.to_json() == results["certainty"]["fit"]
+    assert 0 < found.p <= 1
     assert any("not converged, still moving" in line for line in warnings)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert said[-len(warnings) :] == warnings
@@ -140,8 +146,9 @@ def test_a_signal_stops_the_measurement_of_curvature(experiment: Path) -> None:
     assert [as_json(record) for record in runs[1]] == records_of(Path("runs/whole"))
 
 
-def test_everything_can_be_inspected_between_iterations(experiment: Path) -> None:
-    """Inspection does not change results."""
+def test_everything_can_be_inspected_between_iterations(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inspection does not change results. The test of fit is measured once, because it takes most of the time."""
+    monkeypatch.setattr(measuring, "LEAST_ITERATIONS", 4)
     plain = rl.optimize("tiny.yaml", overrides=SET)
     expected = [as_json(record) for record in plain]
     run = rl.optimize("tiny.yaml", overrides=SET)
@@ -159,6 +166,8 @@ def test_everything_can_be_inspected_between_iterations(experiment: Path) -> Non
         norm = np.sqrt(sum(float(np.square(each, dtype=np.float64).sum()) for each in gradients.values()))
         assert norm == pytest.approx(record.grad_norm, rel=1e-5)
         assert not values_equal(run.parameters, before)
+        found = run.unexplained() if record.iteration in (2, 3) else None
+        assert (found is not None) == (record.iteration == 3)
     assert seen == expected
     assert values_equal(run.parameters, plain.parameters)
     assert (before[KEY] == 0.5).all()

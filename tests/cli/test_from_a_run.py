@@ -1,8 +1,9 @@
-"""Uses of a finished run: `initial: {run: RUN}`, `render RUN`, `export`."""
+"""Uses of a finished run: `initial: {run: RUN}`, `render RUN`, `optimize RUN --free KEY`, `export`."""
 
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
 from reslrb_cli.records.run_folder import read_value, recovered
+from reslrb_cli.report import run_summary
 from reslrb_cli.runs import export
 from reslrb_cli.runs.export import choose_integrator
 from reslrb_cli.scene.load import load_scene
@@ -83,6 +85,47 @@ def test_values_of_a_run_respect_the_bounds(folder: Path) -> None:
     spec = f"[{{key: {tiny.KEY}, initial: {{run: runs/tiny}}, bounds: [0, {float(left.max()) - 1e-6}]}}]"
     with pytest.raises(ConfigError, match=r"parameters\[0\].bounds: exclude the initial value of `poster"):
         start(folder, spec)
+
+
+def test_a_new_run_recovers_one_parameter_more(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It starts from the values that the run found. `latest` is a link, which leads to the new run later."""
+    monkeypatch.setattr(run_summary, "free_command", lambda manifest, run: f"{run} {sorted(manifest['results'])[0]}")
+    common = tiny.settings("run.iterations=2", f"run.output={tmp_path}", "run.final_spp=4")
+    first = f"parameters=[{{key: {LAMP}, initial: [3, 4, 5]}}]"
+    tiny.done("optimize", folder / "tiny.yaml", *common, *tiny.settings(first))
+    result = tiny.done("optimize", tmp_path / "latest", "--free", tiny.KEY, *tiny.settings("run.iterations=1"))
+    last = result.stdout.splitlines()[-1]
+    assert last.startswith(f"next: `{os.path.relpath(tmp_path / 'tiny-2')} elapsed_s` starts from these values")
+    left, begun = (read_parameters(tmp_path / place) for place in ("tiny/parameters", "tiny-2/parameters/initial"))
+    assert np.array_equal(begun[LAMP], left[LAMP])
+    assert not np.array_equal(left[LAMP], [3, 4, 5])
+    assert np.array_equal(begun[tiny.KEY], load_image(folder / "poster.exr"))
+    config = load(tmp_path / "tiny-2/config.yaml")
+    assert [(spec.key, spec.bounds) for spec in config.parameters] == [(LAMP, None), (tiny.KEY, (0, 1))]
+    assert config.parameters[0].initial == RunValue(run=tmp_path / "tiny")
+    assert (config.parameters[1].initial, config.run.iterations) == ("scene", 1)
+
+
+def test_free_in_a_script(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    settings = {"parameters": [{"key": tiny.KEY, "initial": 0.5}]}
+    run = rl.optimize("tiny.yaml", overrides=settings, free=[LAMP, LAMP])
+    assert {key: value.ravel()[0] for key, value in run.parameters.items()} == {tiny.KEY: 0.5, LAMP: 8}
+    assert run.config.parameters[1].bounds == (0, np.inf)
+    for free, line in (
+        (f"{LAMP}s", f"free: `{LAMP}s` matches no parameter of the scene; did you mean `{LAMP}`"),
+        ([tiny.KEY], f"free: `{tiny.KEY}` is already matched by parameters[0]"),
+        (["lamp.*"], "free: `lamp.*` is a glob; name each parameter"),
+        (["wall.to_world"], "free: `wall.to_world` is recovered as a motion"),
+        ([3], "free: is 3; give a key that `reslrb inspect` lists"),
+    ):
+        with pytest.raises(rl.ConfigError) as error:
+            rl.optimize("tiny.yaml", overrides=settings, free=free)
+        assert str(error.value).startswith(line)
+    with pytest.raises(rl.ConfigError, match=r"^free: starts a new run, .* give experiment='runs/tiny' in place"):
+        rl.optimize(resume="runs/tiny", free=[LAMP])
+    with pytest.raises(rl.ConfigError, match=r"^tiny.yaml: parameters\[0\].key: `nothing` matches no parameter"):
+        rl.optimize("tiny.yaml", overrides={"parameters": [{"key": "nothing"}]}, free=[LAMP])
 
 
 def read_into(folder: Path, run: str, texture: np.ndarray) -> None:

@@ -55,6 +55,16 @@ optimize --resume gone
 optimize --resume empty
 optimize --resume note.txt
 optimize --resume a
+optimize a
+optimize empty
+optimize a --free lamp.emitter.radiance.value
+optimize empty --free lamp.emitter.radiance.value
+optimize tiny.yaml --free lamp.emitter.radiance
+optimize tiny.yaml --free poster.reflectance.data
+optimize tiny.yaml --free wall.to_world
+optimize tiny.yaml --free *.radiance.value
+optimize tiny.yaml --free ''
+optimize --resume a --free lamp.emitter.radiance.value
 render tiny.yaml -o x.exr --exposure bright
 render tiny.yaml -o x.png --exposure 0
 render tiny.yaml -o x.png --exposure inf

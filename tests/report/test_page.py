@@ -223,6 +223,17 @@ def test_a_run_that_ended_early_says_why(tmp_path):
     assert page_of(folder).row("Run", "ended early")[1] == "the time is up, after 3 s of iterations"
 
 
+def test_a_model_that_does_not_fit_has_a_command(tmp_path):
+    """The command is beside the entries of `parameters`."""
+    cause = {"key": "ball.alpha", "p": 0.0, "explained": 1.0, "value": [0.2], "proposed": [0.4], "bounds": "[0.02, 1]"}
+    fit = {"p": 0.002, "misfit": 0.06, "energy": 1.0, "is_significant": True, "candidates": [cause]}
+    folder = make_run(tmp_path / "lamp", iterations=0, results={"certainty": {
+        "fit": fit, "parameters": {}, "measure_s": 1.0, "share": 0.1}})  # fmt: skip
+    told = page_of(folder).sections["Parameters"]
+    assert "- {key: ball.alpha, bounds: [0.02, 1]}" in told
+    assert told.strip().endswith(f"reslrb optimize {folder} --free ball.alpha")
+
+
 def test_paths_and_their_sampling_are_reported(tmp_path):
     """Decisions on `auto` settings appear in the order in which they are made."""
     why = "camera paths have 1.5 times the efficiency here (1.2 to 1.9)"

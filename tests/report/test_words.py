@@ -12,7 +12,7 @@ from reslrb_cli.config.files import duration
 from reslrb_cli.errors import printable
 from reslrb_cli.records.measurements import MISFIT
 from reslrb_cli.report.format import count, interval, number, rounded, shorten, with_error
-from reslrb_cli.report.run_summary import advice, last_line, parameter_lines, warnings
+from reslrb_cli.report.run_summary import advice, free_command, last_line, outcome_of, parameter_lines, warnings
 
 # Numbers, times, keys and results in words.
 
@@ -256,9 +256,30 @@ def test_a_model_that_does_not_fit_names_what_would():
     ]
     assert warnings(found) == [
         f"{MISFIT}: lamp.radiance.value (images and targets differ by 6.1 % more than noise explains) "
-        "(another parameter: - {key: ball.alpha, bounds: [0.02, 1]})"
+        "(another parameter: --free ball.alpha)"
     ]
     assert yaml.safe_load(lines[4]) == [{"key": "ball.alpha", "bounds": [0.02, 1]}]
+
+
+@pytest.mark.parametrize(("shares", "named"), [((0.98, 0.31), 1), ((0.6, 0.31), 2), ((0.6, 0.2, 0.2), 3)])
+def test_a_command_recovers_what_explains_the_misfit(shares, named):
+    """Also if another verdict has a proposal that is worth less. A value that gets worse comes first."""
+    causes = [BALL | {"key": f"a {number}", "explained": share} for number, share in enumerate(shares)]
+    command = "reslrb optimize 'runs/a b' " + " ".join(f"--free 'a {number}'" for number in range(named))
+    rose = {"change": "rose", "start": {"mean": 1, "error": 0.1}, "end": {"mean": 2, "error": 0.1}}
+    for about, loss, expected in (
+        ({"verdict": MISFIT}, None, command),
+        ({}, None, command),
+        ({}, rose, ""),
+    ):
+        found = judged(about, fit=FIT | {"candidates": causes}, trend=loss)
+        manifest = {"results": found, "status": "finished"}
+        assert free_command(manifest, "runs/a b") == expected
+        fell = found | {"loss_trend": {"change": "fell"}}
+        assert outcome_of(manifest, fell, "runs/a b").command == command
+    allowed = {"results": judged({}, fit=FIT), "command_line": ["reslrb", "optimize", "--allow-code"]}
+    assert free_command(allowed, "a") == "reslrb optimize a --allow-code --free ball.alpha"
+    assert free_command({"results": judged({})}, "a") == free_command({}, "a") == ""
 
 
 def test_a_misfit_without_a_cause_has_no_remedy():

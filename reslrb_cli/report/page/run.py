@@ -22,7 +22,7 @@ from reslrb_cli.report.page.images import image_rows, seen_table, view_table
 from reslrb_cli.report.page.layout import lay_out, soft
 from reslrb_cli.report.page.values import convergence, parameter_table, texture_pictures
 from reslrb_cli.report.page.workshop import CAPTIONS, VIEWS, workshop
-from reslrb_cli.report.run_summary import error_line, outcome_of, warnings
+from reslrb_cli.report.run_summary import error_line, free_command, outcome_of, warnings
 from reslrb_cli.report.sources import ShownRun
 from reslrb_cli.report.spread import misfit_lines
 
@@ -92,7 +92,7 @@ def run_parts(run: ShownRun) -> dict[str, Markup]:
             parameter_table(results, "now" if run.at_work else "end")
             + Markup().join(soft(found.line()) for found in incomplete_records(run.manifest.get("incomplete") or ()))
             + lay_out("run.certainty", results.get("certainty") or {})
-            + lay_out("run.misfit", misfit_lines(results))
+            + lay_out("run.misfit", misfit_lines(results), free_command(manifest, str(run.path)))
         ),
         "Fabrication": lambda: fabrication(run),
         "Views": lambda: view_table(run.manifest.get("views"), results),
