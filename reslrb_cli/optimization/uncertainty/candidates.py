@@ -24,7 +24,7 @@ from reslrb_cli.errors import describe
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
-from reslrb_cli.optimization.uncertainty.fit import Candidate, Fit, FitRecord
+from reslrb_cli.optimization.uncertainty.fit import LEVEL, Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive, pseudo_inverse
 from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
@@ -37,8 +37,8 @@ logger = logging.getLogger(__name__)
 
 #: Step of the differences, as a share of a parameter's scale.
 STEP = 0.1
-#: Largest `p` of residuals with which the model does not fit, and largest `p` of parameters that are then named.
-LEVEL, LEVEL_OF_NAMED = 0.01, 0.01
+#: Largest `p` of parameters that are named.
+LEVEL_OF_NAMED = 0.01
 #: Smallest explained share of a parameter that is named.
 LEAST_EXPLAINED = 0.1
 #: Smallest eigenvalue of a curvature that counts, as a share of its largest.

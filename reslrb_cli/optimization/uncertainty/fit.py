@@ -8,8 +8,10 @@ residual V_c of cell c is a vector with a component for each pixel and channel. 
     Q(s) = sum over windows of s x s cells (|sum V_c|^2 - sum |V_c|^2)
 
 has a mean of 0 for noise. Random signs of the cells give the distribution of all Q(s) for noise with the same second
-moments, whatever its size and its tails. The largest Q(s), in standard deviations, decides. For this decision, each
-pixel has the weight 1 / (noise^2 + (`FLOOR` target)^2).
+moments, whatever its size and its tails. A gamma distribution with the same skewness gives the probability of each
+Q(s). Large windows have long tails, because they are few. The least probable Q(s) decides, compared with the least
+probable one of each set of random signs. For this decision, each pixel has the weight 1 / (noise^2 + (`FLOOR`
+target)^2). If the decision is not clear, a second look takes more samples.
 
 The `energy` of the misfit uses the weights of the loss. If the misfit is constant in windows of n cells, Q(s) is n - 1
 times the sum of its squares over all cells. The energy is the largest of these sums over the scales s. The misfit then
@@ -33,11 +35,16 @@ from reslrb_cli.optimization.uncertainty.noise import second_derivative
 from reslrb_cli.optimization.views import View, slope
 from reslrb_cli.records.decisions import Jsonable
 from reslrb_cli.seeds import seed
-from reslrb_cli.statistics import Array
+from reslrb_cli.statistics import Array, special
 
 PURPOSE = "fit"
 #: Images of the final values, each with the samples of a step, their least number, and the least samples of all.
 IMAGES, LEAST_IMAGES, LEAST_SPP = 8, 4, 64
+#: Maximum number of looks. The second one has `MORE` times the images of the first, and takes place if the first `p` is
+#: neither small enough nor above `CLEAR`.
+LOOKS, MORE, CLEAR = 2, 4, 0.2
+#: Largest `p` of residuals, over all looks, with which the model does not fit.
+LEVEL = 0.01
 #: Side in pixels of the mean of the noise's variance.
 SMOOTHED = 5
 #: Deviation of a pixel, as a share of the target, that counts as much as noise of the same size.
@@ -51,8 +58,8 @@ MOST_RATIO = 9.0
 MOST_CELLS = 64
 #: Number of random signs, and of values that are computed at once.
 FLIPS, MOST_AT_ONCE = 499, 2**21
-#: Standard deviations of noise that the energy must exceed.
-LEAST_ENERGY = 3.0
+#: Probability of a sum under noise below which it counts as energy.
+RARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -119,9 +126,28 @@ def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], 
     `curvature` has measured the recovered directions. The parameters may still be on their way to the optimum. The part
     of the residual that a Newton step would remove is subtracted. Rendering ends early if `go_on` returns false.
     """
-    means, of_means = _mean_images(problem, go_on)
-    slopes = [finite(slope(view.judge, mean)) * view.share for view, mean in zip(problem.trained, means, strict=True)]
     random = np.random.default_rng(seed(problem.config.run.seed, 0, 0, PURPOSE))
+    images = _Images(problem)
+    images.render(max(IMAGES, -(-LEAST_SPP // problem.config.run.spp)), go_on)
+    return repeat_unclear(
+        lambda: _judge(problem, curvature, images, random),
+        lambda: images.render((MORE - 1) * images.count, go_on),
+    )
+
+
+def repeat_unclear(judge: Callable[[], Fit], more: Callable[[], bool]) -> Fit:
+    """Return the fit that `judge` finds. If it is not clear, take `more` images and judge again. `p` is the probability
+    that noise looks like the residuals in any look.
+    """
+    fits = [judge()]
+    while len(fits) < LOOKS and LEVEL / LOOKS < fits[-1].p <= CLEAR and more():
+        fits.append(judge())
+    return replace(fits[-1], p=min(LOOKS * min(each.p for each in fits), 1.0))
+
+
+def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: np.random.Generator) -> Fit:
+    means, of_means = images.means()
+    slopes = [finite(slope(view.judge, mean)) * view.share for view, mean in zip(problem.trained, means, strict=True)]
     changes, judged, energy, total, size = curvature.newton_change(slopes), [], 0.0, 0.0, 0.0
     variances: list[Array] = []
     for view, mean, change, of_mean in zip(problem.trained, means, changes, of_means, strict=True):
@@ -140,24 +166,36 @@ def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], 
         ratio = float(ratios.mean()) if ratios.size else 0.0
         variances.append(weight**2 * ratio * noise * correlated)
     # Any of the views may show the misfit.
-    together = Coherence(max(each.z for each in judged), np.max([each.noise for each in judged], axis=0), energy)
+    noise = np.max([each.noise for each in judged], axis=0)
+    together = Coherence(max(each.surprisal for each in judged), noise, energy)
     return Fit(together.p, min(energy, total), total, size, slopes, variances)
 
 
-def _mean_images(problem: Problem, go_on: Callable[[], bool]) -> tuple[list[Array], list[Array]]:
-    """Return the mean image of each view (H, W, C), and the variance of its noise."""
-    spp, count = problem.config.run.spp, 0
-    sums, squares = ([np.zeros(view.target.shape) for view in problem.trained] for _ in range(2))
-    for number in range(max(IMAGES, -(-LEAST_SPP // spp))):
-        if number >= LEAST_IMAGES and not go_on():
-            break
-        images = [np.asarray(image, dtype=np.float64) for image in see_images(problem, spp, -number, PURPOSE)]
-        sums = [a + b for a, b in zip(sums, images, strict=True)]
-        squares = [a + b**2 for a, b in zip(squares, images, strict=True)]
-        count += 1
-    means = [each / count for each in sums]
-    pairs = zip(means, squares, strict=True)
-    return means, [np.maximum(square / count - mean**2, 0.0) / (count - 1) for mean, square in pairs]
+class _Images:
+    """Images of the current values, each with the samples of a step: their `count`, and their sums by view."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.count = problem, 0
+        self._sums, self._squares = ([np.zeros(view.target.shape) for view in problem.trained] for _ in range(2))
+
+    def render(self, number: int, go_on: Callable[[], bool]) -> bool:
+        """Add up to `number` images of each view. After `LEAST_IMAGES`, end early if `go_on` returns false. Return
+        whether images were added.
+        """
+        before = self.count
+        while self.count < before + number and (self.count < LEAST_IMAGES or go_on()):
+            found = see_images(self.problem, self.problem.config.run.spp, -self.count, PURPOSE)
+            images = [np.asarray(image, dtype=np.float64) for image in found]
+            self._sums = [a + b for a, b in zip(self._sums, images, strict=True)]
+            self._squares = [a + b**2 for a, b in zip(self._squares, images, strict=True)]
+            self.count += 1
+        return self.count > before
+
+    def means(self) -> tuple[list[Array], list[Array]]:
+        """Return the mean image of each view (H, W, C), and the variance of its noise."""
+        means, count = [each / self.count for each in self._sums], self.count
+        pairs = zip(means, self._squares, strict=True)
+        return means, [np.maximum(square / count - mean**2, 0.0) / (count - 1) for mean, square in pairs]
 
 
 def _noise(variance: Array, target: Array) -> Array:
@@ -211,18 +249,18 @@ def _sums(cells: Array, side: int) -> Array:
 
 @dataclass(frozen=True)
 class Coherence:
-    """The largest Q of a residual in standard deviations `z`, those of its random signs `noise` (FLIPS,), and the
-    energy of the part that neighbouring pixels share.
+    """The least probable Q of a residual: its `surprisal`, which is the negative logarithm of its probability. `noise`
+    (FLIPS,) are those of random signs, and `energy` is that of the part that neighbouring pixels share.
     """
 
-    z: float
+    surprisal: float
     noise: Array
     energy: float
 
     @property
     def p(self) -> float:
         """The probability that noise looks like the residual."""
-        return (1 + int(np.sum(self.noise >= self.z))) / (FLIPS + 1)
+        return (1 + int(np.sum(self.noise >= self.surprisal))) / (FLIPS + 1)
 
 
 def compare(cells: Array, random: np.random.Generator) -> Coherence:
@@ -234,8 +272,17 @@ def compare(cells: Array, random: np.random.Generator) -> Coherence:
     signs = random.choice([-1.0, 1.0], size=(FLIPS, *cells.shape[:2], 1))
     noise = np.concatenate([_products(cells * signs[first : first + at_once]) for first in range(0, FLIPS, at_once)])
     spread = np.maximum(noise.std(axis=0), 1e-300)
-    z, energies = found / spread, found / _pairs(cells.shape[:2])
-    return Coherence(z.max(), (noise / spread).max(axis=1), float(np.where(z > LEAST_ENERGY, energies, 0.0).max()))
+    own, of_noise = surprisals(found / spread, noise / spread), surprisals(noise / spread, noise / spread)
+    energies = np.where(own > -np.log(RARE), found / _pairs(cells.shape[:2]), 0.0)
+    return Coherence(own.max(), of_noise.max(axis=1), float(energies.max()))
+
+
+def surprisals(z: Array, noise: Array) -> Array:
+    """Return the negative logarithms of the probabilities of at least `z` (..., S) in standard deviations. `noise`
+    (N, S) are samples of each distribution with a mean of 0.
+    """
+    k = 4 / np.maximum(np.mean(noise**3, axis=0), 1e-2) ** 2  # the gamma distribution with their skewness
+    return np.asarray(-np.log(np.maximum(special().gammaincc(k, np.maximum(k + np.sqrt(k) * z, 0.0)), 1e-300)))
 
 
 def _products(cells: Array) -> Array:

@@ -145,9 +145,8 @@ class Certainty:
             if stop():
                 return None
             weighed = found.weighed(measured)
-            go_on = _Budget(max(SHARE_OF_FIT * elapsed_s, LEAST_SECONDS_OF_FIT), stop)
             with clock.step() as times:
-                fit = self._test_fit(found, go_on)
+                fit = self._test_fit(found, max(SHARE_OF_FIT * elapsed_s, LEAST_SECONDS_OF_FIT), stop)
             compiled_ms += times.codegen_ms
             fit = fit and fit.without(found.energy_of_textures(weighed))
             if fit is not None and fit.is_significant:
@@ -170,12 +169,15 @@ class Certainty:
             take_gradient(problem)
             problem.apply()
 
-    def _test_fit(self, found: Curvatures, go_on: _Budget) -> FitRecord | None:
-        """Test whether the model fits the targets. An error does not lose the verdicts: the result is then None."""
+    def _test_fit(self, found: Curvatures, seconds: float, stop: Callable[[], bool]) -> FitRecord | None:
+        """Test whether the model fits the targets, and name parameters in the `seconds` that images leave, at least
+        half. An error does not lose the verdicts: the result is then None.
+        """
         from reslrb_cli.optimization.uncertainty.candidates import judge_fit  # late, because it imports SciPy
 
         try:
-            fit = measure_fit(self.problem, found.first, go_on)
+            go_on = _Budget(seconds, stop)
+            fit = measure_fit(self.problem, found.first, _Budget(seconds / 2, stop))
             return judge_fit(self.problem, fit, found.first, go_on)
         except Exception as error:
             logger.warning(f"the fit of the model was not tested: {describe(error)}")
