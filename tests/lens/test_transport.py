@@ -99,6 +99,19 @@ def test_a_picture_that_stays_blurred_ends_before_the_last_grid(
     assert made.converged == (side == 64)
 
 
+def test_a_small_picture_that_stays_blurred_has_one_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    def newton(state: transport._State, *_: object, blur: float = 0.0) -> None:
+        state.residual = float(blur < 2)
+
+    monkeypatch.setattr(transport, "_newton", newton)
+    square = (1.0, 1.0)
+    made = solve(
+        Gradient(np.ones((2, 2)), square), smooth(64), square, square, (21, 64), even(square, square), sharp=True
+    )
+    assert made.h.shape == (21, 64)
+    assert not made.converged
+
+
 def test_the_slope_of_the_picture_is_that_between_pixels() -> None:
     size, target = (1.0, 1.0), (1.2, 0.9)
     start = even(size, target)
