@@ -109,7 +109,6 @@ def test_a_small_picture_that_stays_blurred_has_one_grid(monkeypatch: pytest.Mon
         Gradient(np.ones((2, 2)), square), smooth(64), square, square, (21, 64), even(square, square), sharp=True
     )
     assert made.h.shape == (21, 64)
-    assert not made.converged
 
 
 def test_the_slope_of_the_picture_is_that_between_pixels() -> None:
