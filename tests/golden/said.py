@@ -21,19 +21,20 @@ import numpy as np
 
 FILE, UNSTABLE = Path(__file__).with_name("said.json"), "~"
 ROOT = Path(__file__).resolve().parents[2]
-#: A number with decimals or an exponent. Such numbers may differ by a hundredth, which covers rounding in print.
+#: A number with decimals or an exponent.
 _DECIMAL = re.compile(r"(-?\d+\.\d+(?:e[-+]\d+)?|-?\d+e[-+]\d+)")
-_is_close = partial(math.isclose, rel_tol=0.01, abs_tol=1e-6)
 
 
-def check(name: str, found: Any) -> None:
-    """Compare a text, or a value for JSON, with the stored one of this `name`. Decimals may differ by a hundredth."""
+def check(name: str, found: Any, within: float = 0.01) -> None:
+    """Compare a text, or a value for JSON, with the stored one of this `name`. Decimals may differ by the share
+    `within`; a hundredth covers rounding in print.
+    """
     found = json.loads(json.dumps(found.splitlines() if isinstance(found, str) else found, default=str))
     content = stored()
     if mode := os.environ.get("RESLRB_GOLDEN"):
         content[name] = _stable(found, content.get(name)) if mode == "unstable" else found
         FILE.write_text(_written(content))
-    changed = "\n".join(_differences(found, content.get(name))[:9])
+    changed = "\n".join(_differences(found, content.get(name), within=within)[:9])
     assert not changed, f"{name} has changed; if intended, run the test with RESLRB_GOLDEN=write\n{changed}"
 
 
@@ -53,19 +54,20 @@ def _stable(found: Any, known: Any) -> Any:
     return UNSTABLE if _differences(found, known) else known
 
 
-def _differences(found: Any, known: Any, place: str = "") -> list[str]:
-    """Return a line for each difference. Decimals may differ by a hundredth, also within texts."""
+def _differences(found: Any, known: Any, place: str = "", within: float = 0.01) -> list[str]:
+    """Return a line for each difference. Decimals may differ by the share `within`, also in texts."""
     if isinstance(found, dict) and isinstance(known, dict):
         pairs = ((found.get(key), known.get(key), f"{place} {key}") for key in dict.fromkeys([*known, *found]))
-        return [line for pair in pairs for line in _differences(*pair)]
+        return [line for pair in pairs for line in _differences(*pair, within)]
     if isinstance(found, list) and isinstance(known, list):
         pairs = ((*pair, f"{place} {number}") for number, pair in enumerate(zip_longest(found, known)))
-        return [line for pair in pairs for line in _differences(*pair)]
+        return [line for pair in pairs for line in _differences(*pair, within)]
     if known == UNSTABLE:
         return []
     parts, others = (_DECIMAL.split(str(each)) for each in (found, known))
     is_alike = type(found) is type(known) and parts[::2] == others[::2]
-    if is_alike and all(_is_close(float(a), float(b)) for a, b in zip(parts[1::2], others[1::2], strict=True)):
+    is_close = partial(math.isclose, rel_tol=within, abs_tol=1e-6)
+    if is_alike and all(is_close(float(a), float(b)) for a, b in zip(parts[1::2], others[1::2], strict=True)):
         return []
     return [f"{place}: {found!r} was {known!r}"]
 

@@ -97,7 +97,7 @@ class Bench:
 @case
 def measured_tolerances(patch: Patch) -> Any:
     found = []
-    for plan in ({}, {"kind": "mirror"}, {"ior": "PMMA", "sun": 0}):
+    for plan in ({}, {"kind": "mirror", "ior": "PMMA"}, {"ior": "PMMA", "sun": 0}):
         bench: Any = Bench(**plan)
         numbers: dict[str, Any] = {"setup": {"receiver_distance": 200.0} if plan else None}
         told: list[str] = []

@@ -6,18 +6,33 @@ from __future__ import annotations
 
 import errno
 import itertools
+import json
 import os
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 from records.test_metrics import make_record
 from test_cases import check, ending
 
 from reslrb_cli.cli import options
-from reslrb_cli.records import atomic, decisions, lock, measurement_files, metrics
+from reslrb_cli.records import (
+    atomic,
+    checkpoint,
+    decisions,
+    lock,
+    measurement_files,
+    measurements,
+    metrics,
+    sweeps,
+    tree,
+)  # fmt: skip
 from reslrb_cli.records.measurements import Line
 
 Patch = pytest.MonkeyPatch
@@ -189,6 +204,26 @@ def kept_measurements(patch: Patch) -> Any:
 
 
 @case
+def records_of_lines(patch: Patch) -> Any:
+    """Records as they are written, with more keys, of older versions, and damaged."""
+    missing = {"case": "c", "parameter": "k", "share": 0.25, "standard_error": 0.01, "directions": 2, "seeds": 8}
+    bench = {"label": "a", "options": {"x": 1}, "spp": 4, "status": "ok", "width": 8, "height": None, "texels": 3}
+    old = {name: each for name, each in bench.items() if name not in ("label", "options")}
+    found = []
+    for kind, entry in (
+        (measurements.MissingRecord, missing), (measurements.BenchRecord, bench),
+        (measurements.BenchRecord, bench | {"later": 3, "step_ms": {"median": 1, "min": 0.5, "max": 2}}),
+        (measurements.BenchRecord, old),
+        (measurements.BenchRecord, old | {"integrator": "reslrb", "estimator": "stack"}),
+        (measurements.BenchRecord, old | {"integrator": "prb", "estimator": None}), (measurements.BenchRecord, {}),
+        (measurements.BenchRecord, bench | {"spp": "x"}), (measurements.BenchRecord, bench | {"status": "odd"}),
+    ):  # fmt: skip
+        found.append(str(measurements.record_of(kind, entry)))
+    entries = [missing, missing | {"share": 0.0}, missing | {"share": None}, {"odd": 3}]
+    return found, [record.share for record in measurements.incomplete_records(entries)]
+
+
+@case
 def pages_in_progress(patch: Patch) -> Any:
     """The times at which a page is written that takes 0.1 or 2 seconds, with different shares, until it fails."""
     now, found = [0.0], []
@@ -293,6 +328,70 @@ def errors_of_writing(patch: Patch) -> Any:
             raise error
 
     return [ending(fail, error) for error in failures]
+
+
+# ---- States ----
+
+
+@case
+def states_of_a_folder(patch: Patch) -> Any:
+    Path("c").mkdir()
+    found = [str(checkpoint.newest_checkpoint(Path("c")))]
+    for number in (1, 2, 3):
+        checkpoint.save_checkpoint(Path("c"), number, {"x": np.full(2, number)}, {"y": number} if number > 1 else None)
+        found.append([name, ending(checkpoint.read_state, Path("c", name))] for name in sorted(os.listdir("c")))
+        found[-1] = list(found[-1])
+    sizes: list[str] = []
+    patch.setattr(checkpoint.os, "replace", lambda a, b: sizes.append(f"{Path(a).suffix} to {Path(b).name}"))
+    checkpoint.save_checkpoint(Path("c"), 4, {})
+    return [*found, sizes, str(checkpoint.newest_checkpoint(Path("c")))]
+
+
+@dataclass
+class Branch:
+    """Tree with fields of each kind."""
+
+    number: float
+    word: str = "w"
+    arrays: dict[str, Any] = field(default_factory=dict, metadata=tree.entry("arrays of it"))
+    aside: Any = field(default=None, metadata=tree.PASSING)
+
+
+@case
+def trees_in_files(patch: Patch) -> Any:
+    leaves = {"a": mi.Float([1, 2, 3]), "b": {"c": mi.Color3f(1, 2, 3), "d": mi.Float(7)},
+              "e": mi.TensorXf(np.arange(6.0).reshape(2, 3))}  # fmt: skip
+    arrays, values = tree.entries(Branch(float("inf"), arrays=leaves, aside=object()), Branch(2.0, "last"))
+    checkpoint.save_checkpoint(Path(), 3, arrays, values)
+    stored = tree.Stored(Path(checkpoint.STATE_FILE))
+    back = stored.fill(Branch(0.0, arrays=leaves)).arrays
+    literal = [each.state == dr.VarState.Literal for each in (back["b"]["d"], back["a"])]
+    found: list[Any] = [sorted(arrays), values, stored.read(Branch), back["b"]["c"], type(back["e"]).__name__, literal]
+    others = ({"z": None}, {"a": mi.Float([1, 2])}, {"a": np.zeros((3, 1))}, {"a": None}, {"e": tree.expected((2, 3))})
+    for other in others:
+        found.append(ending(lambda other=other: stored.fill(Branch(0.0, arrays=other)).arrays))
+    checkpoint.save_checkpoint(Path(), 3, {}, {"number": "x"})
+    return [*found, ending(tree.Stored(Path(checkpoint.STATE_FILE)).read, Branch)]
+
+
+@case
+def sweeps_in_files(patch: Patch) -> Any:
+    Path("s").mkdir()
+    two = [sweeps.Combination("a", {"x": 1}), sweeps.Combination("b", {"x": 2})]
+    plan = sweeps.SweepPlan(
+        "c.yaml", ["y=1"], two, [3, 4], {"a-seed=3": sweeps.Failure(5, "no")}, {"f": "1"}, {"g": "2"}
+    )
+    found = [ending(sweeps.read_sweep, Path(name)) for name in ("s", "gone")]
+    plan.write(Path("s"))
+    found += [sweeps.read_sweep(Path("s")) == plan, sweeps.is_sweep(Path("s"))]
+    content = json.loads(Path("s/sweep.json").read_text())
+    names = [{"name": name, "settings": {}} for name in ("a", "A", "../x", "a/b", "")]
+    for change in ({"version": 0, "program": "0.0.9"}, {"seeds": "x"}, {"more": 3}, {"seeds": []},
+                   {"combinations": names[:2]}, *({"combinations": [each]} for each in names[2:])):  # fmt: skip
+        Path("s/sweep.json").write_text(json.dumps(content | change))
+        read = ending(sweeps.read_sweep, Path("s"))
+        found.append(read if isinstance(read, str) else [each.name for each in read.combinations])
+    return found
 
 
 @pytest.mark.usefixtures("llvm")

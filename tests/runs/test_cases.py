@@ -13,8 +13,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from cli import tiny
@@ -22,7 +20,7 @@ from records.test_metrics import make_record
 from test_cases import check, ending
 
 from reslrb_cli.config.loader import loads, parse_override
-from reslrb_cli.records import checkpoint, lock, manifest, run_folder, sweeps, tree
+from reslrb_cli.records import checkpoint, lock, manifest, run_folder
 from reslrb_cli.records.manifest import PROGRAM
 from reslrb_cli.runs import prepare, recorder
 from reslrb_cli.scene import files
@@ -116,6 +114,52 @@ def calls_of_a_run(patch: Patch) -> Any:
             run.settings["run.iterations"], len(run.settings)]  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Stage:
+    """State after some iterations."""
+
+    iteration: int
+    stopped: str = ""
+    values: dict[str, int] = field(default_factory=dict)
+
+
+@case
+def progress_of_runs(patch: Patch) -> Any:
+    """A state that is put back after an interrupt, cleared of its stop, shown, saved and replaced."""
+    done: list[Any] = []
+    patch.setattr(prepare, "put", lambda problem, state: done.append(["put", state.iteration]))
+    patch.setattr(prepare, "save_checkpoint", lambda *given: done.append(given))
+    found = []
+    for stopped in ("", "enough"):
+        now, other = Stage(3, stopped, {"a": 2}), Stage(4)
+        for stands in (now, other, None):
+            made = prepare.RunProgress.__new__(prepare.RunProgress)
+            made.state, made._settled = now, SimpleNamespace(files={"f": "digest"})  # type: ignore[assignment]
+            selection = SimpleNamespace(shown=lambda key, value: f"{key} {value}")
+            config = SimpleNamespace(optimizer=SimpleNamespace(learning_rate=0.5))
+            made.problem = SimpleNamespace(  # type: ignore[assignment]
+                optimizer=SimpleNamespace(stands_at=stands), selection=selection, config=config
+            )
+            patch.setattr(made, "_entries", lambda state: ({"array": state.iteration}, {"value": 1}), raising=False)
+            made.stand()
+            made.go_on()
+            found.append(
+                [made.values(), made.save(Path("x")), made.files, made.state == Stage(3, "", {"a": 2}), made.done]
+            )
+    notes: list[Any] = []
+    made.results = made.nonfinite = made.regularized = SimpleNamespace(add=notes.append)  # type: ignore[assignment]
+    see = notes.append
+    made.certainty = SimpleNamespace(rates=[], see=lambda *states: see([each.iteration for each in states]))  # type: ignore[assignment]
+    made.add(other, make_record(lr=0.25, iteration=3))
+    return (
+        found,
+        done,
+        [each if isinstance(each, list) else each.iteration for each in notes],
+        made.certainty.rates,
+        made.done,
+    )
+
+
 # ---- Run folders ----
 
 
@@ -149,6 +193,35 @@ def values_of_runs(patch: Patch) -> Any:
                       *(ending(run_folder.read_value, Path(name), key) for key in ("a.b", "c", "a.c")),
                       ending(run_folder.exposures, Path(name))])  # fmt: skip
     return found
+
+
+@case
+def killed_runs(patch: Patch) -> Any:
+    """Readers correct the status of a run that was killed, and store it. Others only see it."""
+    here = lock.Holder.here(locked=False)
+    readers = {
+        "folder": run_folder._manifest_of,
+        "reader": manifest.read_manifest,
+        "guest": partial(manifest.read_manifest, mend=False),
+        "opened": opened_content,
+    }
+    found = []
+    for pid in (os.getpid(), 2**22 + 1):
+        for name, read in readers.items():
+            run = made_run(f"{name} {pid == os.getpid()}", status="running", process={**vars(here), "pid": pid})
+            Path(run, "metrics.jsonl").write_text('{"iteration": 0}\n{"iter')
+            Path(run, ".x.3.part").touch()
+            content = ending(read, run)
+            stored = manifest.read_content(run) or {}
+            told = content if isinstance(content, str) else [content["status"], content.get("error")]
+            left = [Path(run, "metrics.jsonl").read_text()[-5:], Path(run, ".x.3.part").exists()]
+            found.append([run.name, told, stored["status"], *left])
+    return found
+
+
+def opened_content(run: Path) -> Any:
+    with run_folder.opened(run) as (_, content):
+        return content
 
 
 @case
@@ -270,70 +343,6 @@ def outputs_of_runs(patch: Patch) -> Any:
 def full_disk(folder: Path) -> Any:
     raise OSError(errno.ENOSPC, "No space left on device")
     yield folder
-
-
-# ---- States ----
-
-
-@case
-def states_of_a_folder(patch: Patch) -> Any:
-    Path("c").mkdir()
-    found = [str(checkpoint.newest_checkpoint(Path("c")))]
-    for number in (1, 2, 3):
-        checkpoint.save_checkpoint(Path("c"), number, {"x": np.full(2, number)}, {"y": number} if number > 1 else None)
-        found.append([name, ending(checkpoint.read_state, Path("c", name))] for name in sorted(os.listdir("c")))
-        found[-1] = list(found[-1])
-    sizes: list[str] = []
-    patch.setattr(checkpoint.os, "replace", lambda a, b: sizes.append(f"{Path(a).suffix} to {Path(b).name}"))
-    checkpoint.save_checkpoint(Path("c"), 4, {})
-    return [*found, sizes, str(checkpoint.newest_checkpoint(Path("c")))]
-
-
-@dataclass
-class Branch:
-    """Tree with fields of each kind."""
-
-    number: float
-    word: str = "w"
-    arrays: dict[str, Any] = field(default_factory=dict, metadata=tree.entry("arrays of it"))
-    aside: Any = field(default=None, metadata=tree.PASSING)
-
-
-@case
-def trees_in_files(patch: Patch) -> Any:
-    leaves = {"a": mi.Float([1, 2, 3]), "b": {"c": mi.Color3f(1, 2, 3), "d": mi.Float(7)},
-              "e": mi.TensorXf(np.arange(6.0).reshape(2, 3))}  # fmt: skip
-    arrays, values = tree.entries(Branch(float("inf"), arrays=leaves, aside=object()), Branch(2.0, "last"))
-    checkpoint.save_checkpoint(Path(), 3, arrays, values)
-    stored = tree.Stored(Path(checkpoint.STATE_FILE))
-    back = stored.fill(Branch(0.0, arrays=leaves)).arrays
-    literal = [each.state == dr.VarState.Literal for each in (back["b"]["d"], back["a"])]
-    found: list[Any] = [sorted(arrays), values, stored.read(Branch), back["b"]["c"], type(back["e"]).__name__, literal]
-    others = ({"z": None}, {"a": mi.Float([1, 2])}, {"a": np.zeros((3, 1))}, {"a": None}, {"e": tree.expected((2, 3))})
-    for other in others:
-        found.append(ending(lambda other=other: stored.fill(Branch(0.0, arrays=other)).arrays))
-    checkpoint.save_checkpoint(Path(), 3, {}, {"number": "x"})
-    return [*found, ending(tree.Stored(Path(checkpoint.STATE_FILE)).read, Branch)]
-
-
-@case
-def sweeps_in_files(patch: Patch) -> Any:
-    Path("s").mkdir()
-    two = [sweeps.Combination("a", {"x": 1}), sweeps.Combination("b", {"x": 2})]
-    plan = sweeps.SweepPlan(
-        "c.yaml", ["y=1"], two, [3, 4], {"a-seed=3": sweeps.Failure(5, "no")}, {"f": "1"}, {"g": "2"}
-    )
-    found = [ending(sweeps.read_sweep, Path(name)) for name in ("s", "gone")]
-    plan.write(Path("s"))
-    found += [sweeps.read_sweep(Path("s")) == plan, sweeps.is_sweep(Path("s"))]
-    content = json.loads(Path("s/sweep.json").read_text())
-    names = [{"name": name, "settings": {}} for name in ("a", "A", "../x", "a/b", "")]
-    for change in ({"version": 0, "program": "0.0.9"}, {"seeds": "x"}, {"more": 3}, {"seeds": []},
-                   {"combinations": names[:2]}, *({"combinations": [each]} for each in names[2:])):  # fmt: skip
-        Path("s/sweep.json").write_text(json.dumps(content | change))
-        read = ending(sweeps.read_sweep, Path("s"))
-        found.append(read if isinstance(read, str) else [each.name for each in read.combinations])
-    return found
 
 
 # ---- Recordings ----

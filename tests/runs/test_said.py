@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -47,6 +48,7 @@ def check(name: str, folder: Path, *words: str, root: str = "runs") -> None:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Working directory with the tiny experiment from three sensors. Pages are not drawn."""
+    logging.getLogger("reslrb_cli").handlers.clear()  # of other tests in this process
     tiny.write_experiment(tmp_path, tiny.scene_seen(*tiny.EYES, rfilter="gaussian"))
     work_in(tmp_path, monkeypatch)
     monkeypatch.setattr(recorder, "write_report", lambda folder, *now: (folder / "report.html").write_text("<html>"))
@@ -115,6 +117,7 @@ SEARCH = ("--search", "optuna", "--trials", "3", "--vary", "optimizer.learning_r
         ("sweep with a failure", ("--vary", "run.spp=[4, 8]"), {"spp=8": (5, "loss is nan")}, ()),
         ("sweep that is interrupted", ("--vary", "run.spp=[4, 8, 6]"), {"spp=8": (130, "interrupted")}, ()),
         ("sweep that is interrupted at an end", ("--vary", "run.spp=[4, 8]"), {"spp=4": (0, "interrupted late")}, ()),
+        ("sweep that is interrupted at its end", ("--vary", "run.spp=[4, 8]"), {"spp=8": (0, "interrupted late")}, ()),
         ("sweep that is interrupted at a failure", ("--vary", "run.spp=[4, 8]"), {"spp=4": (5, "interrupted")}, ()),
         ("sweep without a backend", (), {"seed": (3, "no libLLVM")}, ()),
         ("sweep on a full disk", ("--vary", "run.max_seconds=[2]"), {"seed": (6, "s/x: the disk is full")}, ()),
