@@ -10,8 +10,8 @@ from typing import Any
 
 from reslrb_cli.report.format import number
 
-#: Share of a misfit that leaves nothing to explain.
-EXPLAINED = 0.9
+#: Share of a misfit that leaves nothing to explain, and maximum number of parameters that a command recovers for it.
+EXPLAINED, MOST_FREED = 0.9, 3
 
 
 def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
@@ -46,9 +46,11 @@ def misfit_words(results: Mapping[str, Any]) -> str:
 
 
 def leading_keys(results: Mapping[str, Any]) -> list[str]:
-    """Return the parameters that would reduce the misfit most, and together explain nearly all of it."""
+    """Return the parameters that would reduce the misfit most: those that together explain nearly all of it, or the
+    first `MOST_FREED`.
+    """
     found, explained = [], 0.0
-    for each in _candidates(results):
+    for each in _candidates(results)[:MOST_FREED]:
         if explained >= EXPLAINED:
             break
         found.append(str(each["key"]))

@@ -204,6 +204,15 @@ def test_a_model_that_fits_is_tested_no_further():
     assert (found.p, found.is_significant, found.candidates) == (0.02, False, [])
 
 
+def test_parameters_that_explain_little_are_not_named(monkeypatch: pytest.MonkeyPatch):
+    found = (("a", 5.0, 1e-9), ("b", 0.6, 1e-3), ("c", 0.4, 1e-9), ("d", 9.0, 0.02))
+    tested = [(fall, p, fit.Candidate(key, p, 0.0, [1.0], [])) for key, fall, p in found]
+    monkeypatch.setattr(candidates, "_find_candidates", lambda *_: tested)
+    known = types.SimpleNamespace(biases=[])
+    record = candidates.judge_fit(None, fit.Fit(0.002, 20.0, 20.0, 20.0, [], []), known, lambda: True)
+    assert {each.key: each.explained for each in record.candidates} == pytest.approx({"a": 0.5, "b": 0.06})
+
+
 def test_noise_shows_no_further_parameter():
     found = [linear(np.random.default_rng([5, number]), 3, 0.0)[0].of([0])[1] for number in range(IMAGES)]
     assert 0.35 < np.mean(found) < 0.65

@@ -261,7 +261,9 @@ def test_a_model_that_does_not_fit_names_what_would():
     assert yaml.safe_load(lines[4]) == [{"key": "ball.alpha", "bounds": [0.02, 1]}]
 
 
-@pytest.mark.parametrize(("shares", "named"), [((0.98, 0.31), 1), ((0.6, 0.31), 2), ((0.6, 0.2, 0.2), 3)])
+@pytest.mark.parametrize(
+    ("shares", "named"), [((0.98, 0.31), 1), ((0.6, 0.31), 2), ((0.6, 0.2, 0.2), 3), ((0.4, 0.2, 0.1, 0.1), 3)]
+)
 def test_a_command_recovers_what_explains_the_misfit(shares, named):
     """Also if another verdict has a proposal that is worth less. A value that gets worse comes first."""
     causes = [BALL | {"key": f"a {number}", "explained": share} for number, share in enumerate(shares)]

@@ -40,7 +40,7 @@ STEP = 0.1
 #: Largest `p` of parameters that are named.
 LEVEL_OF_NAMED = 0.01
 #: Smallest explained share of a parameter that is named.
-LEAST_EXPLAINED = 0.1
+LEAST_EXPLAINED = 0.05
 #: Smallest eigenvalue of a curvature that counts, as a share of its largest.
 LEAST_EIGENVALUE = 1e-3
 #: Number of parameters that are measured with `MORE` times the samples, up to a multiple of a step's, as long as noise
