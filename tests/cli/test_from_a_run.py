@@ -197,6 +197,8 @@ def test_any_key_that_inspect_lists_can_be_set(llvm: str, tmp_path: Path, monkey
         now = rendered(*common, "--value", f"{key}={value}")
         np.testing.assert_allclose(now, rl.render(config, initial=False)[0], rtol=1e-5, err_msg=key)
         assert not np.array_equal(now, before), key
+    run = rl.optimize("tiny.yaml", free=[wood])  # its 8 bits are read as floats
+    assert run.parameters[wood].shape == (4, 4, 3)
 
 
 def test_a_run_is_relit_with_its_recovered_values(
