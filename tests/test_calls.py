@@ -79,6 +79,7 @@ make_record(loss=math.nan, held_out=None).to_json()
 [run_folder._sets_initial(parse_override(text)) for text in ("run.spp=4", "parameters=[{key: a}]", "parameters=[{initial: 3}]", "parameters[0]={initial: 3}", "parameters[0].initial=3", "parameters[0].initial.run=a", "parameters[0].key=a")]
 run_folder.exposed(np.ones((1, 1, 4)), np.array([2.0, 3, 4]), 3), run_folder.exposed(np.ones((1, 1, 2)), 2.0, 1)
 [sweeps.in_words(value) for value in (0.1, 1e-5, 0.1234567, 3, True, None, "a b", "a: b", "reslrb:stack(paths=both)", {"a": [1, 2.5]}, [])]
+[sweeps.in_words(value) for value in ("größe/片.exr", "word " * 40, "it's", "a\\nb", "", " ", "yes", "3", "null", "[a]", "#", float("inf"), float("nan"), -0.0, {"größe": "é"}, ["é", {}], ("a", 1), 10**20, 1e20)]
 sweeps.short_keys(["a.b.c", "a.x.c", "d"]), sweeps.short_keys(["spp"]), sweeps.short_keys(["run.spp", "target.render.spp"])
 sweeps.short_keys(["run.spp", "run.xspp"])
 sweeps.label({"run.spp": 4, "optimizer.type": "sgd"}), sweeps.label({})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import json
 import os
 import signal
 import sys
@@ -15,10 +16,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import click
+import numpy as np
 import pytest
+from cli.tiny import reslrb, write_experiment
 from test_cases import check, ending
 
+from reslrb_cli import cli
 from reslrb_cli.cli import gradcheck, init, jobs, options, render, sweep, terminal
+from reslrb_cli.records import checkpoint
+from reslrb_cli.records.manifest import PROGRAM
 from reslrb_cli.records.measurements import BenchStatus, MissingRecord
 from reslrb_cli.scene.catalog import Value
 
@@ -239,6 +245,99 @@ def signals_that_count(patch: Patch) -> Any:
             os.close(read)
             os.close(write)
             found.append([sent.name, now, interrupts.requested, interrupts._count])
+    return found
+
+
+@case
+def descriptors_of_contexts(patch: Patch) -> Any:
+    """Who is told of signals, in contexts within each other, and after `ignore`; descriptors and handlers that stay."""
+
+    def state(*contexts: Any) -> list[Any]:
+        now = signal.set_wakeup_fd(-1)
+        signal.set_wakeup_fd(now, warn_on_full_buffer=False)
+        pipes = [context._pipe and context._pipe[1] for context in contexts]
+        kept = [signal.getsignal(number) == before for number, before in handlers.items()]
+        alive = [context._thread.is_alive() for context in contexts]
+        return ["program" if now == own[1] else pipes.index(now) if now in pipes else now, kept, alive]
+
+    handlers = {number: signal.getsignal(number) for number in terminal.SIGNALS}
+    own = os.pipe()
+    os.set_blocking(own[1], False)
+    earlier = signal.set_wakeup_fd(own[1], warn_on_full_buffer=False)
+    found, closed, close = list[Any](), list[int](), os.close
+    patch.setattr(os, "close", lambda descriptor: closed.append(descriptor) or close(descriptor))  # type: ignore
+    try:
+        for ignores in (False, True):
+            outer, inner = terminal.Interrupts(), terminal.Interrupts()
+            with outer:
+                found.append(state(outer, inner))
+                with inner:
+                    pipes = [*(outer._pipe or ()), *(inner._pipe or ())]
+                    found.append(state(outer, inner))
+                    if ignores:
+                        inner.ignore()
+                        found.append(state(outer, inner))
+                found.append(state(outer, inner))
+            found.append([*state(outer, inner), [pipe in closed for pipe in pipes]])
+            closed.clear()
+        return found
+    finally:
+        signal.set_wakeup_fd(earlier)
+        for descriptor in own:
+            os.close(descriptor)
+        for number, before in handlers.items():
+            signal.signal(number, before)
+
+
+@case
+def last_acts_of_commands(patch: Patch) -> Any:
+    """What the contexts of commands do at the end of the process."""
+    found: list[Any] = []
+
+    def begin(*given: Any, **named: Any) -> Any:
+        found.append([given, {name: getattr(each, "__name__", each) for name, each in named.items()}])
+        raise KeyboardInterrupt
+
+    plan: Any = SimpleNamespace(device="device", variant="v", budget_s=1.0, rounds=None)
+    asked: Any = SimpleNamespace(json_file=None, spp=None, seeds=4, budget=1.0, integrators=None, suite="extreme:a",
+                                 config=lambda: SimpleNamespace(variant="v"))  # fmt: skip
+    measured = SimpleNamespace(conditions=lambda: "conditions", keys=["a"])
+    patch.setattr("reslrb_cli.measure.missing.MissingCheck.of_config", lambda config, spp: measured)
+    patch.setattr("reslrb_cli.measure.extreme.CASES", {"a": SimpleNamespace()})
+    for name in ("origin_of", "set_variant", "device_name"):
+        patch.setattr(gradcheck, name, str)
+    for module in (gradcheck, options, cli):
+        patch.setattr(module, "Interrupts", begin)
+    for call in (
+        lambda: options.measuring(SimpleNamespace, plan, 0.0).__enter__(),  # type: ignore[attr-defined]
+        lambda: gradcheck._run(asked, "v", asked), lambda: gradcheck.run_missing(asked, None, "v"),  # type: ignore
+        lambda: gradcheck.run_suite(asked), cli.run,
+    ):  # fmt: skip
+        with pytest.raises(KeyboardInterrupt):
+            call()
+    return found
+
+
+@case
+def settings_of_commands(patch: Patch) -> Any:
+    """Every command with `--set` applies it to each kind of subject: a scene, a configuration and a run."""
+    write_experiment(Path())
+    Path("run/checkpoint").mkdir(parents=True)
+    checkpoint.save_checkpoint(Path("run/checkpoint"), 2, {"parameter/a.b": np.ones(3)})
+    Path("run/config.yaml").write_text(Path("tiny.yaml").read_text())
+    Path("run/manifest.json").write_text(json.dumps({"program": PROGRAM, "status": "finished"}))
+    found, context = [], click.Context(cli.main)
+    for name in cli.main.list_commands(context):
+        command = cli.main.get_command(context, name)
+        assert command is not None
+        by_name = {each.name: each for each in command.params}
+        if "overrides" not in by_name:
+            continue
+        more = {"init": ["-o", "out.yaml"], "render": ["-o", "x.exr"], "export": ["-o", "out"],
+                "sweep": ["--vary", "run.spp=[4]"]}.get(name, [])  # fmt: skip
+        for subject in ("scene.xml", "tiny.yaml", "run"):
+            result = reslrb(name, subject, *more, "--set", "run.nothing=1")
+            found.append([name, subject, result.exit_code, result.stderr.splitlines()[-1][:70]])
     return found
 
 

@@ -330,6 +330,52 @@ def folders_that_are_continued(patch: Patch) -> Any:
 
 
 @case
+def folders_without_writing(patch: Patch) -> Any:
+    """Each subfolder may be read-only, full, or a file."""
+    found: list[Any] = []
+    made = run_folder.tempfile.TemporaryFile
+    for place in (".", *run_folder.SUBFOLDERS):
+        for code in (errno.EROFS, errno.EACCES, errno.ENOSPC, errno.EIO):
+
+            def refused(dir: Path, place: str = place, code: int = code) -> Any:
+                if Path(dir) == Path("run", place):
+                    raise OSError(code, os.strerror(code))
+                return made(dir=dir)
+
+            Path("run").mkdir(exist_ok=True)
+            patch.setattr(run_folder.tempfile, "TemporaryFile", refused)
+            ended = ending(run_folder.check_writable, run_folder.RunFolder(Path("run")))
+            found.append([place, errno.errorcode[code], ended])
+        patch.setattr(run_folder.tempfile, "TemporaryFile", made)
+        if place != ".":
+            os.rename(Path("run", place), "aside")
+            Path("run", place).touch()
+            found.append([place, "file", ending(run_folder.check_writable, run_folder.RunFolder(Path("run")))])
+            Path("run", place).unlink()
+    return found
+
+
+@case
+def folders_that_are_there(patch: Patch) -> Any:
+    """A folder is there under its name and behind links, but not in another place, nor another folder of its name."""
+    Path("link").symlink_to("run")
+    Path("above").symlink_to(".")
+    found = []
+    for name in ("run", "link", "above/run", "above/link"):
+        for locked in (True, False):
+            Path("run").mkdir()
+            with lock.FolderLock(Path("run")) if locked else nullcontext(None) as held:
+                folder, seen = run_folder.RunFolder(Path(name), held), []
+                for change in (lambda: None, lambda: os.rename("run", "moved"), Path("run").mkdir, Path("run").rmdir,
+                               lambda: os.rename("moved", "run"), Path("run").rmdir, Path("run").touch):  # fmt: skip
+                    change()
+                    seen.append([folder.is_there, str(folder.fault)])
+            Path("run").unlink()
+            found.append([name, locked, seen])
+    return found
+
+
+@case
 def outputs_of_runs(patch: Patch) -> Any:
     Path("file").touch()
     Path("link").symlink_to("gone")
