@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +23,7 @@ from cli.tiny import reslrb, write_experiment
 from test_cases import check, ending
 
 from reslrb_cli import cli
-from reslrb_cli.cli import gradcheck, init, jobs, options, render, sweep, terminal
+from reslrb_cli.cli import bench, convergence, gradcheck, init, jobs, options, render, sweep, terminal
 from reslrb_cli.records import checkpoint
 from reslrb_cli.records.manifest import PROGRAM
 from reslrb_cli.records.measurements import BenchStatus, MissingRecord
@@ -339,6 +340,56 @@ def settings_of_commands(patch: Patch) -> Any:
             result = reslrb(name, subject, *more, "--set", "run.nothing=1")
             found.append([name, subject, result.exit_code, result.stderr.splitlines()[-1][:70]])
     return found
+
+
+@case
+def files_of_comparisons(patch: Patch) -> Any:
+    """The file grows with each round, and an interrupted measurement says so to it."""
+    found: list[Any] = []
+    rows = [SimpleNamespace(method=SimpleNamespace(spp=spp, max_depth=3, label="m"), message=why)
+            for spp, why in ((2, ""), (4, "why"))]  # fmt: skip
+    columns = SimpleNamespace(head=lambda: "head", line=lambda cells: f"line {cells}")
+    plan: Any = SimpleNamespace(cases=[SimpleNamespace(label="m")], variant="v", swept="spp")
+    patch.setattr("reslrb_cli.report.tables.bench_columns", lambda labels, swept: columns)
+    patch.setattr("reslrb_cli.report.tables.bench_cells", lambda record, value: value)
+    patch.setattr("reslrb_cli.report.tables.method_cells", lambda overall, rounds: (overall, rounds))
+    patch.setattr("reslrb_cli.measure.judgement.Judgement", Judged)
+    patch.setattr(convergence, "_table", lambda session: columns)
+    for module in (bench, convergence):
+        patch.setattr(module, "origin_of", str)
+        patch.setattr(module, "_conditions", lambda *given: "conditions")
+        patch.setattr(module, "echo", lambda line: found.append(line))
+    members = [SimpleNamespace(status=status) for status in (BenchStatus.OK, BenchStatus.REFUSED)]
+    for requested in (False, True):
+        notes = Notes(requested)
+        notes.done = found
+        for module, steps in ((bench, [rows[:1], rows[1:], rows]), (convergence, [1, 3, 4, 5, 6, 8])):
+            session = SimpleNamespace(run=lambda steps=steps: steps, results=lambda: "results",
+                                      of=lambda kind: members, facts={})  # fmt: skip
+            opened = nullcontext((session, notes))
+            patch.setattr(module, "measuring", lambda *given, opened=opened, **more: opened)
+            patch.setattr(module, "Keeper", lambda *given, notes=notes: notes)
+        for plan.swept in ("spp", "max_depth"):
+            found.append(bench._run(plan, None, 0.0))
+        asked: Any = SimpleNamespace(json_file=None, draws=None)
+        with pytest.raises(KeyboardInterrupt):
+            convergence._run(plan, asked, 0.0)
+    return found
+
+
+class Judged:
+    """Stand-in of a `Judgement` that ends the command where the results are read."""
+
+    ready = True
+
+    def __init__(self, session: Any) -> None:
+        pass
+
+    def overall(self, member: Any) -> str:
+        return str(member.status)
+
+    def results(self) -> Any:
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)

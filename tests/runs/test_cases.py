@@ -376,6 +376,42 @@ def folders_that_are_there(patch: Patch) -> Any:
 
 
 @case
+def beginnings_of_recordings(patch: Patch) -> Any:
+    """All that a recording writes before the first iteration, with and without weights and true values."""
+    found: list[Any] = []
+
+    def noted(name: str) -> Any:
+        return lambda *given: found.append([name, *(str(each) if isinstance(each, Path) else each for each in given)])
+
+    for name in ("write_image", "write_parameters", "write_mask"):
+        patch.setattr(recorder, name, noted(name))
+    for weights, truth in ((None, {}), (np.array([[0.0, 0.5]]), {"a": 1.0})):
+        views = [SimpleNamespace(sensor=sensor, target=[[sensor, 2.0]], weights=weights) for sensor in (0, 3)]
+        problem = SimpleNamespace(views=views, truth=truth, masks={"a": "mask"}, values=lambda: "values")
+        names = {name: noted(name) for name in ("_save_checkpoint", "_write_image", "_write_images")}
+        stub: Any = SimpleNamespace(
+            **names, problem=problem, _image_name=lambda name, sensor: f"{name} {sensor}",
+            folder=SimpleNamespace(parameters=Path("p"), images=Path("i")),
+        )  # fmt: skip
+        recorder.Recording._begin(stub)
+        found.append("end")
+    return found
+
+
+@case
+def failures_at_the_end(patch: Patch) -> Any:
+    """Each measurement that fails is told once, and the results so far are kept after each."""
+    found: list[Any] = []
+    patch.setattr(recorder.logger, "warning", found.append)
+    stub: Any = SimpleNamespace(unmeasured=[], _note_results=lambda: found.append("kept"))
+    for text in ("first", "", "second"):
+        recorder.Recording._add(
+            stub, f"{text} failed", lambda text=text: int(text) if text else found.append("measured")
+        )
+    return found, stub.unmeasured
+
+
+@case
 def outputs_of_runs(patch: Patch) -> Any:
     Path("file").touch()
     Path("link").symlink_to("gone")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -383,9 +384,12 @@ def merged_scenes(patch: Patch) -> Any:
     ball = {"type": "sphere", "bsdf": {"type": "diffuse"}}
     parts = {"type": "scene", "a": ball, "b": {**ball, "center": [2, 0, 0]}, "lamp": {"type": "point"},
              "camera": {"type": "perspective"}}  # fmt: skip
+    named = {"type": "ref", "id": "paint"}  # a material that the user shares is no merged one
+    shared = {"type": "scene", "paint": {"type": "diffuse"}} | parts | {"a": {**ball, "bsdf": named}}
+    shared["b"] = {**parts["b"], "bsdf": named}
     found = []
-    for optimize in (False, True):
-        held = load.SceneInMemory(mi.load_dict(parts, optimize=optimize), "c.yaml")
+    for optimize, whole in itertools.product((False, True), (parts, shared)):
+        held = load.SceneInMemory(mi.load_dict(whole, optimize=optimize), "c.yaml")
         keys = sorted(key for key in mi.traverse(held.scene).properties if "reflectance" in key)
         for wanted, objects in ((keys, []), (keys[:1], []), (["b.bsdf.reflectance.value"], []), (["gone.*"], []),
                                 ([], ["a"]), ([], ["lamp"]), ([], ["gone"])):  # fmt: skip
