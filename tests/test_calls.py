@@ -39,7 +39,19 @@ from reslrb_cli.report import run_summary
 from reslrb_cli.runs import export as exports
 from reslrb_cli.runs import log, loggers, prepare, search, workshop
 from reslrb_cli.runs import sweep as planned
-from reslrb_cli.scene import cameras, catalog, deformation, edges, graph, proposal, rays, upsampling, values, visibility
+from reslrb_cli.scene import (
+    cameras,
+    catalog,
+    deformation,
+    edges,
+    graph,
+    needs,
+    proposal,
+    rays,
+    upsampling,
+    values,
+    visibility,
+)
 from reslrb_cli.scene import export as exporting
 from reslrb_cli.scene import images as pictures
 
@@ -156,6 +168,7 @@ pictures._to_xyz([0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329])
 edges.welded_edges(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2], [1, 3, 2], [0, 1, 4]]))
 edges.angle_between(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)), edges.turned(mi.Vector3f(2, 0, 0), mi.Vector3f(1, 1, 0), mi.Vector3f(0, 0, 3)), edges.across(mi.Vector3f(2, 0, 0), mi.Vector3f(1, 1, 0))
 visibility._texels_met([], [[1, 0, 0.1], [0, -1, 0.2], [0, 0, 1]], (4, 3), SimpleNamespace(uv=mi.Point2f([-2.3, -0.9, -0.1, 0.3, 0.99, 1.7], [2.6, 1.3, 0.5, 0, -0.4, -1.9]), is_valid=lambda: True))[0]
+[needs._film_obstacle(SimpleNamespace(id=lambda: "s", film=lambda name=name: SimpleNamespace(class_name=lambda: name))) for name in ("HDRFilm", "SpecFilm", "Other")]
 edges.outline_direction(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1), mi.Point2f([0.1, 0.5, 0.9, 0.3], [0.2, 0.4, 0.6, 0.9]), 0.25)
 ball().cosine(mi.Point3f([0, 5, 9], 0, 0)), ball().center, ball().radius
 graph.face_normals(np.array([[[0.0, 0, 0], [2, 0, 0], [0, 1, 0]]])), rays.grid(2), rays.ray_offset(mi.Point3f(1, -3, 2)), rays.visible(100)

@@ -33,6 +33,26 @@ def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
 
 
 @case
+def workloads(patch: Patch) -> Any:
+    """What is done before files are sent, and who is asked for permission."""
+    found: list[Any] = []
+    patch.setattr(engine, "check_files", lambda files, config: found.append(["check", files]))
+    patch.setattr(engine, "target_arrays", lambda views: views)
+
+    def write(name: str, text: str) -> Any:
+        found.append(["write", name, text])
+        Path(name).write_text(text)
+
+    patch.setattr(engine, "write_archive", lambda path, views: write(str(path), views))
+    for allows, own in ((True, True), (True, False), (False, True), (False, False)):
+        problem = SimpleNamespace(config=SimpleNamespace(allows_code=allows), views="views")
+        course = SimpleNamespace(problem=problem, files="files", save=lambda folder: write(engine.STATE_FILE, "state"))
+        load = engine.workload_of(course, Path(), 3, own)
+        found.append([allows, own, load.files, load.arguments, load.threads, load.asks_for_code])
+    return found
+
+
+@case
 def connections(patch: Patch) -> Any:
     """What is done in turn, at both kinds of places, if all goes well, if the caller fails, and if nobody answers."""
     import dask
