@@ -19,10 +19,10 @@ from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import INCOMPLETE, MISFIT, incomplete_records
 from reslrb_cli.records.metrics import Record
 from reslrb_cli.report.format import count, line, number, shorten, with_error
-from reslrb_cli.report.spread import leading_keys, misfit_lines, misfit_words, noise_line, spread_words
+from reslrb_cli.report.spread import MOVING, leading_keys, misfit_lines, misfit_words, noise_line, spread_words
 
 #: Recorded verdicts on a value: SETTLED is reliable, and the others give the reason why a value is not.
-SETTLED, MOVING, UNDETERMINED = "settled", "still moving", "not determined"
+SETTLED, UNDETERMINED = "settled", "not determined"
 NOISE, UNSEEN, LOST = "below the noise", "not seen", "effect lost"
 
 #: Minimum share of the target's noise in a spread for it to be the cause that hides a value.

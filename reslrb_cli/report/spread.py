@@ -10,6 +10,8 @@ from typing import Any
 
 from reslrb_cli.report.format import number
 
+#: Verdict of a value that has not converged (`verdicts.Verdict`).
+MOVING = "still moving"
 #: Share of a misfit that leaves nothing to explain, and maximum number of parameters that a command recovers for it.
 EXPLAINED, MOST_FREED = 0.9, 3
 
@@ -65,7 +67,10 @@ def misfit_lines(results: Mapping[str, Any]) -> list[str]:
     words = misfit_words(results)
     if not words:
         return []
-    lines = [f"misfit: {words}; the spreads allow for a hidden misfit of the same size"]
+    abouts = (_certainty(results).get("parameters") or {}).values()
+    allowed = "the spreads allow for a hidden misfit of the same size"
+    cause = "values that are still moving may be the cause"
+    lines = [f"misfit: {words}; {cause if any(each.get('verdict') == MOVING for each in abouts) else allowed}"]
     found = _candidates(results)
     lines += ["these entries of `parameters` would reduce it:"] if found else []
     for each in found:

@@ -300,3 +300,11 @@ def test_false_alarms_and_power_of_two_looks(size: float, count: int, least: flo
 
         found.append(fit.repeat_unclear(judge, lambda: True).p <= fit.LEVEL)
     assert least <= np.mean(found) <= most
+
+
+@pytest.mark.parametrize(("factor", "right"), [(-1.0, 1.0), (-0.5, 1.0), (-4.0, 0.25), (2.0, 0.0), (0.0, 0.0)])
+def test_a_newton_step_that_is_too_long_is_shortened(factor: float, right: float):
+    residuals = [np.random.default_rng(number).normal(size=(4, 4, 3)) for number in range(2)]
+    changes, weights = [factor * each for each in residuals], [np.full((4, 4, 3), size) for size in (1.0, 3.0)]
+    assert fit.useful_part(residuals, changes, weights) == pytest.approx(right)
+    assert fit.useful_part([residuals[0], 0 * residuals[1]], changes, weights) <= right

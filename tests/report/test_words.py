@@ -13,6 +13,7 @@ from reslrb_cli.errors import printable
 from reslrb_cli.records.measurements import MISFIT
 from reslrb_cli.report.format import count, interval, number, rounded, shorten, with_error
 from reslrb_cli.report.run_summary import advice, free_command, last_line, outcome_of, parameter_lines, warnings
+from reslrb_cli.report.spread import misfit_lines
 
 # Numbers, times, keys and results in words.
 
@@ -282,6 +283,12 @@ def test_a_command_recovers_what_explains_the_misfit(shares, named):
     allowed = {"results": judged({}, fit=FIT), "command_line": ["reslrb", "optimize", "--allow-code"]}
     assert free_command(allowed, "a") == "reslrb optimize a --allow-code --free ball.alpha"
     assert free_command({"results": judged({})}, "a") == free_command({}, "a") == ""
+
+
+def test_values_on_their_way_may_cause_a_misfit():
+    about = {"verdict": "still moving", "spread": [0.1]}
+    [first, *_] = misfit_lines({"certainty": {"fit": FIT, "parameters": {"ball.alpha": about}}})
+    assert first.endswith("differ by 6.1 % more than noise explains; values that are still moving may be the cause")
 
 
 def test_a_misfit_without_a_cause_has_no_remedy():

@@ -148,13 +148,18 @@ def repeat_unclear(judge: Callable[[], Fit], more: Callable[[], bool]) -> Fit:
 def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: np.random.Generator) -> Fit:
     means, of_means = images.means()
     slopes = [finite(slope(view.judge, mean)) * view.share for view, mean in zip(problem.trained, means, strict=True)]
-    changes, judged, energy, total, size = curvature.newton_change(slopes), [], 0.0, 0.0, 0.0
+    trues = [np.array(view.target, dtype=np.float64) for view in problem.trained]
+    weights = [second_derivative(view, mean) for view, mean in zip(problem.trained, means, strict=True)]
+    steps = curvature.newton_change(slopes)
+    changes = [view.kept(step) for view, step in zip(problem.trained, steps, strict=True)]
+    left = [view.kept(finite(mean - true)) for view, mean, true in zip(problem.trained, means, trues, strict=True)]
+    part = useful_part(left, changes, weights)
+    residuals = [own + part * change for own, change in zip(left, changes, strict=True)]
+    judged, energy, total, size = [], 0.0, 0.0, 0.0
     variances: list[Array] = []
-    for view, mean, change, of_mean in zip(problem.trained, means, changes, of_means, strict=True):
-        true = np.array(view.target, dtype=np.float64)
-        residual = view.kept(finite(mean - true) + change)
+    for view, residual, true, weight, of_mean in zip(problem.trained, residuals, trues, weights, of_means, strict=True):
         lattice, correlated = lattice_of(problem, view)
-        noise, weight = _noise(of_mean, true), second_derivative(view, mean)
+        noise = _noise(of_mean, true)
         if curvature.biases:  # a kink, as that of `l1`, has a derivative that says nothing about single pixels
             weight = view.kept(np.full_like(weight, weight.mean()))
         judged.append(compare(cells_of(residual / np.sqrt(noise), lattice), random))
@@ -169,6 +174,16 @@ def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: 
     noise = np.max([each.noise for each in judged], axis=0)
     together = Coherence(max(each.surprisal for each in judged), noise, energy)
     return Fit(together.p, min(energy, total), total, size, slopes, variances)
+
+
+def useful_part(residuals: Sequence[Array], changes: Sequence[Array], weights: Sequence[Array]) -> float:
+    """Return the part of a Newton step, from 0 to 1, at which the squares of `residuals` + part * `changes` have the
+    smallest sum. If the images do not determine the parameters, a whole step may be far too long.
+    """
+    rows = list(zip(residuals, changes, weights, strict=True))
+    along = sum(float(np.sum(weight * residual * change)) for residual, change, weight in rows)
+    square = sum(float(np.sum(weight * change**2)) for _, change, weight in rows)
+    return float(np.clip(-along / square, 0.0, 1.0)) if square > 0 else 0.0
 
 
 class _Images:
