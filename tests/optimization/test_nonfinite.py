@@ -139,7 +139,7 @@ PLACES = {
         "iterate step gradient", "step measure_curvature gradient", "__init__ _images see_images",
         "_derivatives _images see_images", "measure sample_gradient", "target_noises _noises render_in_passes",
         "by_entry _two_probes _probe", "_by_entry_of_target _two_probes _probe", "products _two_probes _probe",
-        "measure_fit _mean_images see_images",
+        "measure_fit render see_images",
     },
     "auto, moving": {"step update exposed_images"},
     "sgd": {
