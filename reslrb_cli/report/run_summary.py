@@ -44,7 +44,7 @@ LONGER = "more iterations"
 CLEANER, UNBIASED, RECOVER = "a cleaner target", "a loss without bias", "another parameter"
 
 #: Proposals in the order of priority: the first ones make the later ones useless.
-ORDER = ("a limit", "a lower rate", RECOVER, "a higher rate", "a new run from here", LONGER, UNBIASED, CLEANER)
+ORDER = ("a limit", "a lower rate", "a higher rate", "a new run from here", LONGER, RECOVER, UNBIASED, CLEANER)
 
 #: Maximum number of parameters named for one verdict.
 MOST_NAMED = 3
