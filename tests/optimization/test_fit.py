@@ -7,6 +7,7 @@ from __future__ import annotations
 import types
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -308,3 +309,49 @@ def test_a_newton_step_that_is_too_long_is_shortened(factor: float, right: float
     changes, weights = [factor * each for each in residuals], [np.full((4, 4, 3), size) for size in (1.0, 3.0)]
     assert fit.useful_part(residuals, changes, weights) == pytest.approx(right)
     assert fit.useful_part([residuals[0], 0 * residuals[1]], changes, weights) <= right
+
+
+@pytest.mark.parametrize(("kind", "z", "right"), [("exponential", 5.0, 6.0), ("standard_normal", 3.0, 6.6)])
+def test_the_probability_of_a_sum_includes_its_skewness(kind: str, z: float, right: float):
+    noise = getattr(np.random.default_rng(0), kind)(size=(200000, 1))
+    found = fit.surprisals(np.array([z]), (noise - noise.mean()) / noise.std())
+    assert found[0] == pytest.approx(right, abs=0.2)
+
+
+def stub(**more: Any) -> types.SimpleNamespace:
+    """Return a problem with one view, whose target is black."""
+    view = types.SimpleNamespace(judge=None, share=1.0, target=np.zeros((12, 12, 3)), kept=lambda image: image)
+    run = types.SimpleNamespace(spp=8, seed=0)
+    return types.SimpleNamespace(trained=[view], config=types.SimpleNamespace(run=run), **more)
+
+
+def test_the_residual_lacks_a_useful_step_only(monkeypatch: pytest.MonkeyPatch):
+    """A step that is 30 times too long would leave a misfit."""
+    monkeypatch.setattr(fit, "slope", lambda judge, image: image)
+    monkeypatch.setattr(fit, "second_derivative", lambda view, image: np.ones_like(image))
+    monkeypatch.setattr(fit, "lattice_of", lambda problem, view: (1, 1.0))
+    random = np.random.default_rng(3)
+    noise, offset = 0.01 * random.normal(size=(12, 12, 3)), 0.05 * np.ones((12, 12, 3))
+    images = types.SimpleNamespace(means=lambda: ([noise + offset], [np.full_like(noise, 1e-4)]))
+    for step, right in ((-offset, True), (-30 * offset, True), (0 * offset, False)):
+        curvature = types.SimpleNamespace(biases=False, newton_change=lambda slopes, step=step: [step])
+        assert (fit._judge(stub(), curvature, images, random).p > fit.LEVEL) == right
+
+
+def test_the_second_look_has_four_times_the_images(monkeypatch: pytest.MonkeyPatch):
+    counts: list[int] = []
+    monkeypatch.setattr(fit, "see_images", lambda problem, spp, number, purpose: [np.full((12, 12, 3), number)])
+    monkeypatch.setattr(fit, "_judge", lambda problem, curvature, images, random: (counts.append(images.count),
+                                                                                   found_fit(0.1))[1])  # fmt: skip
+    fit.measure_fit(stub(), types.SimpleNamespace(), lambda: True)
+    assert counts == [fit.IMAGES, fit.MORE * fit.IMAGES]
+
+
+def test_images_have_half_of_the_time(monkeypatch: pytest.MonkeyPatch):
+    seconds: list[float] = []
+    monkeypatch.setattr(measuring, "measure_fit", lambda problem, curvature, go_on: seconds.append(go_on._seconds))
+    monkeypatch.setattr(candidates, "judge_fit", lambda problem, fit, known, go_on: seconds.append(go_on._seconds))
+    certainty = object.__new__(measuring.Certainty)
+    certainty.problem = stub()
+    certainty._test_fit(types.SimpleNamespace(first=None), 10.0, lambda: False)
+    assert seconds == [5.0, 10.0]
