@@ -27,7 +27,7 @@ def marked(family: Family) -> Any:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("family", map(marked, FAMILIES))
+@pytest.mark.parametrize("family", [marked(family) for family in FAMILIES])
 def test_verdicts_of_runs_are_calibrated(family: Family, llvm, tmp_path, monkeypatch):
     """At most 5 % of the settled values are wrong, apart from chance, and spreads are about as large as errors."""
     monkeypatch.setenv("RESLRB_CACHE", str(tmp_path / "cache"))
