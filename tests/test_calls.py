@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from golden import said
+from golden.cases import shown
 from kit import work_in
 from records.test_metrics import make_record
 
@@ -388,17 +389,6 @@ def terminal_line(is_terminal: bool) -> list[bytes]:
         patch.setattr(terminal.select, "select", lambda read, write, _, wait=9: ([], [] if wait else write, []))
         terminal._say("interrupted")
     return written
-
-
-def shown(value: Any) -> Any:
-    """Return a result for JSON, arrays with all their numbers."""
-    if isinstance(value, (list, tuple)):
-        return [shown(each) for each in value]
-    if dr.is_array_v(value) or isinstance(value, (np.ndarray, np.generic)):
-        return np.array(value).astype(float).round(6).tolist()
-    if isinstance(value, dict):
-        return {str(key): shown(each) for key, each in value.items()}
-    return said.plain(value)
 
 
 @pytest.mark.usefixtures("llvm")

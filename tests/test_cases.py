@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,10 +15,8 @@ import pytest
 from cli import tiny
 from cli.tiny import write_photo
 from golden import said
-from kit import work_in
-from test_calls import shown
+from golden.cases import Cases, ending, shown
 
-from reslrb_cli import errors
 from reslrb_cli.cli import init, inspect, jobs, optimize, options, render, serve, terminal
 from reslrb_cli.records import images, manifest, sweeps
 from reslrb_cli.records.manifest import PROGRAM
@@ -29,21 +25,7 @@ from reslrb_cli.runs import sweep as planned
 from reslrb_cli.scene.xml import dictionary
 
 Patch = pytest.MonkeyPatch
-#: The cases. Each is called in a folder of its own, and returns what is compared.
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
-
-
-def ending(function: Callable[..., Any], *given: Any, **more: Any) -> Any:
-    """Return the result of a function, or its error."""
-    try:
-        return function(*given, **more)
-    except (errors.ReslrbError, OSError, RuntimeError, ValueError) as error:
-        return f"{type(error).__name__}: {error}"
+case = Cases()
 
 
 # ---- The command line ----
@@ -470,16 +452,4 @@ def values_of_dictionaries(patch: Patch) -> Any:
     return [found, {name: image.shape for name, image in writer.images.items()}]
 
 
-def check(function: Callable[[Patch], Any], folder: Path, patch: Patch) -> None:
-    """Compare the result of a case with the stored one. Handlers of log lines stay as they were."""
-    work_in(folder, patch)
-    handlers = logging.getLogger("reslrb_cli").handlers.copy()
-    found = json.loads(json.dumps(shown(function(patch)), default=str))
-    logging.getLogger("reslrb_cli").handlers[:] = handlers
-    said.check(f"case {function.__name__}", said.masked(found, folder), within=1e-3)
-
-
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

@@ -10,7 +10,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ import click
 import numpy as np
 import pytest
 from cli.tiny import reslrb, write_experiment
-from test_cases import check, ending
+from golden.cases import Cases, ending
 
 from reslrb_cli import cli
 from reslrb_cli.cli import bench, convergence, gradcheck, init, jobs, options, render, sweep, terminal
@@ -30,12 +29,7 @@ from reslrb_cli.records.measurements import BenchStatus, MissingRecord
 from reslrb_cli.scene.catalog import Value
 
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 def proposals(count: int, first: int, kind: str = "bsdf") -> list[Any]:
@@ -392,6 +386,4 @@ class Judged:
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = case.test()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from test_cases import check, ending
+from golden.cases import Cases, ending
 
 from reslrb_cli.config.schema import Fabrication
 from reslrb_cli.lens.solid import Sheet
@@ -18,13 +17,8 @@ from reslrb_cli.runs import export, workshop
 
 pytestmark = pytest.mark.usefixtures("combined")
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
+case = Cases()
 SPOT = np.exp(-((np.indices((16, 16)) - 7.0) ** 2).sum(0) / 9)
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
 
 
 def set_up(lamp: dict[str, Any], middle: float = 9, behind: bool = False, **more: Any) -> Any:
@@ -187,7 +181,4 @@ def files_of_solids(patch: Patch) -> Any:
     return found, told
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

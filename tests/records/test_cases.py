@@ -8,7 +8,6 @@ import errno
 import itertools
 import json
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,8 +17,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from golden.cases import Cases, ending
 from records.test_metrics import make_record
-from test_cases import check, ending
 
 from reslrb_cli.cli import options
 from reslrb_cli.records import (
@@ -36,12 +35,7 @@ from reslrb_cli.records import (
 from reslrb_cli.records.measurements import Line
 
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 class Plain(Line):
@@ -394,7 +388,4 @@ def sweeps_in_files(patch: Patch) -> Any:
     return found
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,18 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from golden.cases import Cases, ending
 from records.test_metrics import make_record
-from test_cases import check, ending
 
 from reslrb_cli.runs import callbacks, log
 
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 @case
@@ -53,11 +47,15 @@ def calls_of_callbacks(patch: Patch) -> Any:
         def end(self, run: Any, status: str) -> None:
             self._hear("end", status)
 
+    raising = f"in line {Kept._hear.__code__.co_firstlineno + 3} "
+
+    def in_place(text: Any) -> Any:
+        return text.replace(raising, "in its place ") if isinstance(text, str) else text
+
     views = [{"sensor": 0, "shown": 2.0}, {"sensor": 3, "shown": 0.5}]
     found = []
     for fails in ("", "begin", "iteration", "image", "end"):
         for optional in (False, True):
-            listeners = [Kept("a", fails, optional), Kept("b")]
             listeners = [Kept("a", fails, optional), Kept("b")]
             made = callbacks.Calls(listeners, "run", SimpleNamespace(views=views))  # type: ignore[arg-type]
             pixels = {0: np.ones((1, 2, 3)), 3: np.zeros((1, 2, 3))}
@@ -69,7 +67,8 @@ def calls_of_callbacks(patch: Patch) -> Any:
                 partial(made.iteration, make_record(iteration=3)),
                 partial(made.end, "failed"),
             )
-            found.append([fails, optional, [ending(act) for act in acts], bool(made), heard.copy(), lines.copy()])
+            ends = [in_place(ending(act)) for act in acts]
+            found.append([fails, optional, ends, bool(made), heard.copy(), [*map(in_place, lines)]])
             heard.clear()
             lines.clear()
     return found, bool(callbacks.Calls([], "run", None))  # type: ignore[arg-type]
@@ -121,7 +120,4 @@ def appended_lines(patch: Patch) -> Any:
     return [*found, log.append_log(gone, ["c"])]  # type: ignore[func-returns-value]
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

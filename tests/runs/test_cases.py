@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Callable
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from cli import tiny
+from golden.cases import Cases, ending
 from records.test_metrics import make_record
-from test_cases import check, ending
 
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.records import checkpoint, lock, manifest, run_folder
@@ -26,12 +25,7 @@ from reslrb_cli.runs import prepare, recorder
 from reslrb_cli.scene import files
 
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 def config_of(*sets: str, text: str = tiny.CONFIG) -> Any:
@@ -548,7 +542,4 @@ def engines_of_clusters(patch: Patch) -> Any:
     return found
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

@@ -6,7 +6,7 @@ import logging
 import os
 import pickle
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_cases import check, ending
+from golden.cases import Cases, ending
 
 from reslrb_cli.cluster import connection
 from reslrb_cli.errors import ConfigError
@@ -24,12 +24,7 @@ calls = pytest.importorskip("reslrb_cli.cluster.calls", reason="pip install resl
 engine = pytest.importorskip("reslrb_cli.cluster.engine", reason="pip install reslrb[cluster]", exc_type=ImportError)
 
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 @case
@@ -259,7 +254,4 @@ def standings_of_problems(patch: Patch) -> Any:
     return done
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

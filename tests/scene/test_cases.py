@@ -7,7 +7,6 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from golden import said
-from test_cases import check, ending
+from golden.cases import Cases, ending
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.parameters import ParameterSpec
@@ -28,12 +27,7 @@ from reslrb_cli.scene.xml.read import read_description, tag_lines
 
 pytestmark = pytest.mark.usefixtures("combined")
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 def described(text: str, version: str = "3.0.0", options: Any = None) -> Any:
@@ -397,7 +391,4 @@ def merged_scenes(patch: Patch) -> Any:
     return found
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -11,19 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from golden import said
-from test_cases import check, ending
+from golden.cases import Cases, ending
 
 from reslrb_cli.scene import graph, needs, rays
 from reslrb_cli.scene.graph import SceneGraph
 
 pytestmark = pytest.mark.usefixtures("combined")
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 GLASS, MIRROR, COAT = {"type": "dielectric"}, {"type": "conductor"}, {"type": "plastic"}
@@ -164,7 +157,4 @@ def small_lamps_in_view(patch: Patch) -> Any:
     return seen, [[lamp.shape.id(), round(graph._pixels(sensor, lamp.shape), 4)] for lamp in found]
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from golden.cases import Cases, ending
 from scene.test_cases import ROOM, described, lines, made_room, picture
-from test_cases import check, ending
 
 from reslrb_cli.scene import catalog
 from reslrb_cli.scene.export import Replacing
@@ -22,12 +21,7 @@ from reslrb_cli.scene.xml.read import read_description
 
 pytestmark = pytest.mark.usefixtures("combined")
 Patch = pytest.MonkeyPatch
-CASES: list[Callable[[Patch], Any]] = []
-
-
-def case(function: Callable[[Patch], Any]) -> Callable[[Patch], Any]:
-    CASES.append(function)
-    return function
+case = Cases()
 
 
 # ---- Reading ----
@@ -315,7 +309,4 @@ def mended_scenes(patch: Patch) -> Any:
     return found
 
 
-@pytest.mark.usefixtures("llvm")
-@pytest.mark.parametrize("function", CASES, ids=lambda function: function.__name__)
-def test_cases(function: Callable[[Patch], Any], tmp_path: Path, monkeypatch: Patch) -> None:
-    check(function, tmp_path, monkeypatch)
+test_cases = pytest.mark.usefixtures("llvm")(case.test())
