@@ -34,9 +34,8 @@ from reslrb_cli.records.metrics import Record
 from reslrb_cli.records.run_folder import check_output
 from reslrb_cli.report.run_summary import descriptions
 from reslrb_cli.runs.callbacks import Callback
-from reslrb_cli.runs.freeing import with_freed
 from reslrb_cli.runs.loggers import Callbacks, callbacks_of
-from reslrb_cli.runs.prepare import PreparedRun, begin
+from reslrb_cli.runs.prepare import PreparedRun, begin, with_freed
 from reslrb_cli.runs.recorder import Recording
 from reslrb_cli.runs.resume import open_earlier
 
@@ -353,17 +352,17 @@ class Run:
         return dict(self._begun.course.problem.truth)
 
     def unexplained(self) -> FitRecord | None:
-        """Return what the model does not explain in the targets, and which further parameters would reduce this misfit.
+        """Return the result of the test of fit, with further parameters that would reduce a misfit of the model.
 
         The record has the attributes of `certainty.fit` in the manifest. `is_significant` is true if noise does not
         explain the difference between the images and their targets. `misfit` is the size of the difference, as a share
-        of the targets. `p` is the probability that noise looks like it. `candidates` are the parameters, the most
-        effective one first. Each has `key`, `p`, `explained` (its share of the misfit), `value`, `proposed` and
-        `bounds`. The method `to_json()` returns all of this as a dictionary.
+        of the targets. `p` is the probability that noise causes as large a difference. `candidates` are the parameters,
+        the most effective one first. Each has `key`, `p`, `explained` (its share of the misfit), `value`, `proposed`
+        and `bounds`. The method `to_json()` returns the whole record as a dictionary.
 
-        A run with a folder has this record at its end. Otherwise, each call measures it, which takes about a third of
-        the time of the iterations, and does not change the run. The result is None after fewer than 20 iterations, and
-        if the loss is not one of separate pixels.
+        A run with a folder has this record at its end. Otherwise, each call measures it, as the end of a run with a
+        folder does, and does not change the run. The result is None after fewer than 20 iterations, and if the loss
+        does not judge each pixel apart.
         """
         course, measured = self._begun.course, self._begun.manifest.results.get("certainty")
         if measured is not None and measured.get("fit") is not None:

@@ -161,7 +161,7 @@ def _begin(config_file: Path, options: OptimizeOptions, workers: Cluster | None)
         workers.check()
     variant = start_variant(config)
     if options.free:
-        from reslrb_cli.runs.freeing import with_freed
+        from reslrb_cli.runs.prepare import with_freed
 
         config = with_freed(config, options.free, "--free")
     callbacks = _callbacks(config, options)

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import drjit as dr
@@ -197,13 +196,13 @@ def choose_step(case: Case, integrator: Any, direction: Direction, seeds: Sequen
         for step in STEPS
     }
     best, least, before = direction, np.inf, np.inf
-    for number, (larger, smaller) in enumerate(pairwise(STEPS)):
+    for larger, smaller, shorter in zip(STEPS, STEPS[1:], (*STEPS[2:], None), strict=False):
         change = samples[larger] - samples[smaller]
         spread = float(change.std(ddof=1))
         changed = abs(float(change.mean())) + spread / np.sqrt(len(seeds))
         # Truncation shrinks at least as fast as h, even at kinks.
         truncation = changed / ((larger / smaller) ** 2 - 1) if changed <= before * smaller / larger else changed
-        for shorter in STEPS[number + 2 :][:1]:
+        if shorter is not None:
             further = samples[smaller] - samples[shorter]
             certain = abs(float(further.mean())) - float(further.std(ddof=1)) / np.sqrt(len(seeds))
             truncation += max(certain, 0.0) * shorter / smaller

@@ -18,8 +18,9 @@ from reslrb_cli.optimization.problem import ErrorMeter
 from reslrb_cli.records.manifest import Status
 from reslrb_cli.records.measurements import INCOMPLETE, MISFIT, incomplete_records
 from reslrb_cli.records.metrics import Record
+from reslrb_cli.report import spread
 from reslrb_cli.report.format import count, line, number, shorten, with_error
-from reslrb_cli.report.spread import MOVING, leading_keys, misfit_lines, misfit_words, noise_line, spread_words
+from reslrb_cli.report.spread import MOVING
 
 #: Recorded verdicts on a value: SETTLED is reliable, and the others give the reason why a value is not.
 SETTLED, UNDETERMINED = "settled", "not determined"
@@ -140,7 +141,7 @@ def _longer(results: Mapping[str, Any]) -> Remedy | None:
 
 def _recover(results: Mapping[str, Any]) -> Remedy | None:
     """Return the proposal for a run whose model does not fit, if further parameters would reduce the misfit."""
-    keys = leading_keys(results)
+    keys = spread.leading_keys(results)
     return Remedy(RECOVER, " ".join(shlex.join(["--free", key]) for key in keys)) if keys else None
 
 
@@ -185,7 +186,7 @@ def find_remedy(results: Mapping[str, Any], key: str) -> Remedy | None:
 
     Return None for all other values, and if the records are insufficient.
     """
-    about, measured = _about(results, key), results.get("certainty") or {}
+    about, measured = _about(results, key), spread.certainty_of(results)
     if about.get("verdict") == LOST:
         return Remedy("a limit", "its own bounds: [LOW, HIGH]")
     if about.get("verdict") == NOISE and measured.get("is_biased") and _is_of_target(about):
@@ -228,7 +229,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
         shares = [record.percent() for record in incomplete_records(results.get("incomplete") or ())
                   if record.parameter in keys and verdict == INCOMPLETE]  # fmt: skip
         line += f" ({', '.join(shares)} of it is missing)" if shares else ""
-        line += f" ({misfit_words(results)})" if verdict == MISFIT else ""
+        line += f" ({spread.misfit_words(results)})" if verdict == MISFIT else ""
         own = {remedy.words for key in keys if (remedy := find_remedy(results, key)) is not None}
         line += f" ({best.words}: {best.setting})" if best is not None and best.words in own else ""
         lines.append(line)
@@ -237,7 +238,7 @@ def certainty_lines(results: Mapping[str, Any]) -> list[str]:
 
 def _source(results: Mapping[str, Any]) -> str:
     """Return the source of the noise that hides values if `_is_of_target` is true."""
-    return " of the images" if (results.get("certainty") or {}).get("is_biased") else " of the target"
+    return " of the images" if spread.certainty_of(results).get("is_biased") else " of the target"
 
 
 def _is_of_target(about: Mapping[str, Any]) -> bool:
@@ -257,17 +258,13 @@ def _rate_setting(measured: Mapping[str, Any], rate: float, factor: float) -> tu
     return f"--set optimizer.learning_rate={value}" if common else f"its own learning_rate: {value}", factor
 
 
-def _parameters(results: Mapping[str, Any]) -> dict[str, Any]:
-    return dict((results.get("certainty") or {}).get("parameters") or {})
-
-
 def verdicts_of(results: Mapping[str, Any]) -> dict[str, str]:
     """Return the verdict on each parameter. The result is empty if nothing was measured."""
-    return {key: str(about.get("verdict", SETTLED)) for key, about in _parameters(results).items()}
+    return {key: str(about.get("verdict", SETTLED)) for key, about in spread.certainties(results).items()}
 
 
 def _about(results: Mapping[str, Any], key: str) -> dict[str, Any]:
-    return dict(_parameters(results).get(key) or {})
+    return dict(spread.certainties(results).get(key) or {})
 
 
 #: An image has improved if its loss ratio, end over start, is below this value.
@@ -429,12 +426,12 @@ def parameter_lines(results: Mapping[str, Any], width: int) -> list[str]:
     columns = {title: cells for title, cells in columns.items() if any(cells)}
     verdicts = [verdict_words(results, key) for key in listed]
     if any(verdicts):
-        columns |= {"spread": [spread_words(results, key) for key in listed], "verdict": verdicts}
+        columns |= {"spread": [spread.spread_words(results, key) for key in listed], "verdict": verdicts}
     titles, rows = list(columns), list(zip(*columns.values(), strict=True))
     lines = _table(listed, titles, rows, width) or _blocks(listed, titles, rows, width)
     if len(shown) > len(listed):
         lines.append(shorten(f"and {count(len(shown) - len(listed), 'more parameter')}, on the page", width))
-    return [*lines, *wrap(noise_line(results), width), *misfit_lines(results)]
+    return [*lines, *wrap(spread.noise_line(results), width), *spread.misfit_lines(results)]
 
 
 def units_differ(results: Mapping[str, Any]) -> bool:

@@ -20,7 +20,7 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
     """Return one standard deviation, for each entry of a small parameter or for a typical entry of a large parameter.
     The result is empty if unknown.
     """
-    spread = ((_certainty(results).get("parameters") or {}).get(key) or {}).get("spread")
+    spread = (certainties(results).get(key) or {}).get("spread")
     if not spread:
         return ""
     if all(value == spread[0] for value in spread):
@@ -30,7 +30,7 @@ def spread_words(results: Mapping[str, Any], key: str, sign: str = "+-") -> str:
 
 def noise_line(results: Mapping[str, Any]) -> str:
     """Return a line that says that the spreads exclude the target's noise. The result is empty if they include it."""
-    measured = _certainty(results)
+    measured = certainty_of(results)
     if measured.get("target_noise") not in ("left out", "in part"):
         return ""
     which = "" if measured["target_noise"] == "left out" else " that are files"
@@ -41,7 +41,7 @@ def misfit_words(results: Mapping[str, Any]) -> str:
     """Return the size of the difference between the images and their targets that noise does not explain. The result is
     empty if noise explains the difference.
     """
-    fit = _certainty(results).get("fit") or {}
+    fit = certainty_of(results).get("fit") or {}
     if not fit.get("is_significant"):
         return ""
     return f"images and targets differ by {100 * fit['misfit']:.2g} % more than noise explains"
@@ -67,10 +67,9 @@ def misfit_lines(results: Mapping[str, Any]) -> list[str]:
     words = misfit_words(results)
     if not words:
         return []
-    abouts = (_certainty(results).get("parameters") or {}).values()
-    allowed = "the spreads allow for a hidden misfit of the same size"
+    is_moving = any(about.get("verdict") == MOVING for about in certainties(results).values())
     cause = "values that are still moving may be the cause"
-    lines = [f"misfit: {words}; {cause if any(each.get('verdict') == MOVING for each in abouts) else allowed}"]
+    lines = [f"misfit: {words}; {cause if is_moving else 'the spreads allow for a hidden misfit of the same size'}"]
     found = _candidates(results)
     lines += ["these entries of `parameters` would reduce it:"] if found else []
     for each in found:
@@ -80,13 +79,19 @@ def misfit_lines(results: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _certainty(results: Mapping[str, Any]) -> dict[str, Any]:
+def certainty_of(results: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the record of the certainty of the values. The result is empty if nothing was measured."""
     return dict(results.get("certainty") or {})
+
+
+def certainties(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the certainty of each parameter, by key."""
+    return dict(certainty_of(results).get("parameters") or {})
 
 
 def _candidates(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the parameters that would reduce the misfit, as recorded (`fit.Candidate`)."""
-    return list((_certainty(results).get("fit") or {}).get("candidates") or ())
+    return list((certainty_of(results).get("fit") or {}).get("candidates") or ())
 
 
 def _spec(candidate: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@
 - `changes` and `check_changes` tell which settings of an experiment may change when its run is resumed.
 - `prepare` makes a problem from a configuration. The problem is ready to run. `manifest_of` makes the problem's
     manifest.
+- `with_freed` adds entries of `parameters` to a configuration.
 - `PreparedRun` is a run that is ready to start or to resume. `begin` makes a `PreparedRun` for a new run.
 - `RunProgress` has the state and the results of a run.
 """
@@ -22,6 +23,7 @@ import numpy as np
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.integrators import ReslrbConfig
 from reslrb_cli.config.loader import dump
+from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import flattened
 from reslrb_cli.errors import ConfigError, printable
@@ -29,6 +31,7 @@ from reslrb_cli.integrators.reslrb import Reslrb
 from reslrb_cli.measure.missing import check_missing
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.autotune.sampling import plan_rows
+from reslrb_cli.optimization.loading import load_configured
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
@@ -43,8 +46,10 @@ from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.runs.callbacks import Callback, Calls, RunInfo
 from reslrb_cli.runs.log import collected
+from reslrb_cli.scene.catalog import describe, owner_of
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.needs import unsupported_part
+from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.visibility import sees_lamps
 
 
@@ -354,3 +359,33 @@ def begin(
         lambda: RunFolder.create(config.source, run.output, folder or run.folder_name, dump(config), manifest),
         said,
     )
+
+
+def with_freed(config: Config, keys: Sequence[str], source: str) -> Config:
+    """Return the experiment that also recovers the scene's parameters `keys`, within their usual bounds. They start at
+    the values of the scene. A variant must be set.
+
+    Raises a ConfigError, located by `source`, for a key that the scene does not have, that cannot be recovered, or that
+    the experiment recovers already.
+    """
+    from reslrb_cli.scene.proposal import spec_of, usual_bounds  # late, because few runs need them
+
+    if wrong := [key for key in keys if not isinstance(key, str) or not key]:
+        raise ConfigError(source, "", f"is {wrong[0]!r}; give a key that `reslrb inspect` lists")
+    keys = list(dict.fromkeys(keys))
+    if not keys:
+        return config
+    scene = load_configured(config, keys=keys)
+    try:
+        specs = [*config.parameters, *(ParameterSpec(key=key) for key in keys)]
+        params = select_parameters(scene, specs, config.source).params
+    except ConfigError as error:
+        place = re.match(r"parameters\[(\d+)\]", error.key)
+        if place is None or int(place[1]) < len(config.parameters):
+            raise
+        raise ConfigError(source, "", error.message) from None
+    if globs := [key for key in keys if key not in params.properties]:
+        raise ConfigError(source, "", f"`{globs[0]}` is a glob; name each parameter")
+    bounds = (usual_bounds(describe(params, key, values=True), owner_of(params, key)) for key in keys)
+    freed = [spec_of(*each) for each in zip(keys, bounds, strict=True)]
+    return config.model_copy(update={"parameters": [*config.parameters, *freed]})

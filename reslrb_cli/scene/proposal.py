@@ -14,7 +14,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import yaml
 
+from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters, owner_of
@@ -257,6 +259,11 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     for bsdf in graph.of_type(mi.BSDF):  # nested BSDFs are visible together with their parent
         shares[bsdf] = max((shares.get(owner, 0.0) for owner in graph.owning_bsdfs(bsdf)), default=0.0)
     return shares
+
+
+def spec_of(key: str, bounds: str | None) -> ParameterSpec:
+    """Return the entry of `parameters` that recovers `key` within the `bounds` of `usual_bounds`."""
+    return ParameterSpec(key=key, bounds=None if bounds is None else yaml.safe_load(bounds))
 
 
 def usual_bounds(info: ParameterInfo, owner: tuple[str, str] = ("", "")) -> str | None:

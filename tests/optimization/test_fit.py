@@ -286,8 +286,8 @@ def test_without_time_there_is_no_second_look():
 
 @pytest.mark.parametrize(("size", "count", "least", "most"), [(0.0, 60, 0.0, 0.04), (0.5, 40, 0.75, 1.0)])
 def test_false_alarms_and_power_of_two_looks(size: float, count: int, least: float, most: float):
-    """The second look has a quarter of the noise's variance. Of 100 images with the misfit, one look finds 39, and both
-    find 88. Of 300 without it, both find 2.
+    """The second look has a quarter of the noise's variance. Of 100 images with the misfit, one look finds 36, and both
+    find 88. Of 300 without it, both find 1.
     """
     found = []
     for number in range(count):

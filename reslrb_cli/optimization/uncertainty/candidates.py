@@ -17,9 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-import yaml
 
-from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.errors import describe
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
@@ -30,7 +28,7 @@ from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
-from reslrb_cli.scene.proposal import Proposal, propose
+from reslrb_cli.scene.proposal import Proposal, propose, spec_of
 from reslrb_cli.statistics import Array, rms, special
 
 logger = logging.getLogger(__name__)
@@ -75,8 +73,7 @@ def _find_candidates(
 ) -> list[tuple[float, float, Candidate]]:
     """Return the further parameters, each after the fall of the loss and its `p`. Significant ones come first."""
     proposals = {each.info.key: each for each in _unrecovered(problem)}
-    specs = [ParameterSpec(key=key, bounds=None if each.bounds is None else yaml.safe_load(each.bounds))
-             for key, each in proposals.items()]  # fmt: skip
+    specs = [spec_of(key, each.bounds) for key, each in proposals.items()]
     if not specs:
         return []
     selection = select_parameters(problem.scene, specs, problem.config.source)

@@ -287,9 +287,10 @@ def compare(cells: Array, random: np.random.Generator) -> Coherence:
     signs = random.choice([-1.0, 1.0], size=(FLIPS, *cells.shape[:2], 1))
     noise = np.concatenate([_products(cells * signs[first : first + at_once]) for first in range(0, FLIPS, at_once)])
     spread = np.maximum(noise.std(axis=0), 1e-300)
-    own, of_noise = surprisals(found / spread, noise / spread), surprisals(noise / spread, noise / spread)
-    energies = np.where(own > -np.log(RARE), found / _pairs(cells.shape[:2]), 0.0)
-    return Coherence(own.max(), of_noise.max(axis=1), float(energies.max()))
+    all_of_them = surprisals(np.vstack([found, noise]) / spread, noise / spread)
+    energies = np.where(all_of_them[0] > -np.log(RARE), found / _pairs(cells.shape[:2]), 0.0)
+    least_probable = all_of_them.max(axis=1)
+    return Coherence(float(least_probable[0]), least_probable[1:], float(energies.max()))
 
 
 def surprisals(z: Array, noise: Array) -> Array:
