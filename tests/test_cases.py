@@ -453,3 +453,15 @@ def values_of_dictionaries(patch: Patch) -> Any:
 
 
 test_cases = pytest.mark.usefixtures("llvm")(case.test())
+
+
+def test_a_changed_result_is_found(tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.delenv("RESLRB_GOLDEN", raising=False)
+    table = Cases()
+
+    @table
+    def last_lines_of_a_run(patch: Patch) -> Any:
+        return "another result"
+
+    with pytest.raises(AssertionError, match="^case last_lines_of_a_run has changed"):
+        table.test()(last_lines_of_a_run, tmp_path, monkeypatch)

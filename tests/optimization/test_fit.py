@@ -57,6 +57,11 @@ def test_a_constant_misfit_is_found(kind: str):
     assert np.mean([each.p <= fit.LEVEL for each in found]) >= 0.9
 
 
+def test_no_random_signs_are_as_rare_as_a_large_misfit():
+    random = np.random.default_rng(4)
+    assert fit.compare(fit.cells_of(3 + random.normal(size=(16, 16, 3)), 1), random).p == 1 / (fit.FLIPS + 1)
+
+
 @pytest.mark.parametrize(("side", "lattice"), [(24, 1), (25, 1), (200, 1), (210, 3)])
 def test_the_energy_is_that_of_the_misfit(side: int, lattice: int):
     """It does not depend on the size of the image, or on the lattice."""
