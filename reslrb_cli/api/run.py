@@ -360,9 +360,9 @@ class Run:
         the most effective one first. Each has `key`, `p`, `explained` (its share of the misfit), `value`, `proposed`
         and `bounds`. The method `to_json()` returns the whole record as a dictionary.
 
-        A run with a folder has this record at its end. Otherwise, each call measures it, as the end of a run with a
-        folder does, and does not change the run. The result is None after fewer than 20 iterations, and if the loss
-        does not judge each pixel apart.
+        A run with a folder has this record at its end. Otherwise, each call makes the measurement that ends a run
+        with a folder. A call does not change the run. The result is None after fewer than 20 iterations, and if the
+        loss does not judge each pixel apart.
         """
         course, measured = self._begun.course, self._begun.manifest.results.get("certainty")
         if measured is not None and measured.get("fit") is not None:

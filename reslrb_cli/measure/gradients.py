@@ -12,8 +12,8 @@ steps therefore give the truncation error of the smaller step (Richardson 1911).
 Paths that change discontinuously cause noise that grows as h shrinks. The noise appears as variation of D(r h) - D(h)
 between seeds. If light moves, rounding errors of the scene can be equal for all seeds. If a change does not shrink with
 h, the change is not truncation, and counts in full. Rounding errors of the scene, and waves of a BSDF's tables, are
-equal for all seeds and grow as h shrinks, at most as 1 / h. A change by a shorter step therefore bounds them for the
-longer step. The step with the smallest sum of errors is chosen, and its error that seeds do not show is stored.
+equal for all seeds. They grow at most as 1 / h, so a change by a shorter step bounds them for the longer step. The step
+with the smallest sum of errors is chosen. Its error that is equal for all seeds is stored.
 """
 
 from __future__ import annotations

@@ -112,8 +112,8 @@ def _test(
     proposals: Mapping[str, Proposal],
     count: int,
 ) -> list[tuple[float, float, Candidate]]:
-    """Return the tested parameters, each after the fall of the loss and its `p`. Significant ones come first, and among
-    them larger falls. `count` is the number of parameters in the first round of tests.
+    """Return the tested parameters, each after the fall of the loss and its `p`. Significant ones come first, sorted
+    by the fall. `count` is the number of parameters in the first round of tests.
     """
     if not directions:
         return []

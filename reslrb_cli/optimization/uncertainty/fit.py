@@ -9,9 +9,9 @@ residual V_c of cell c is a vector with a component for each pixel and channel. 
 
 has a mean of 0 for noise. Random signs of the cells give the distribution of all Q(s) for noise with the same second
 moments, whatever its size and its tails. A gamma distribution with the same skewness gives the probability of each
-Q(s). Large windows have long tails, because they are few. The least probable Q(s) decides, compared with the least
-probable one of each set of random signs. For this decision, each pixel has the weight 1 / (noise^2 + (`FLOOR`
-target)^2). If the decision is not clear, a second look takes more samples.
+Q(s). An image has few large windows, so their sums have long tails. The least probable Q(s) of the residual is compared
+with the least probable one of each set of random signs. For this decision, each pixel has the weight
+1 / (noise^2 + (`FLOOR` target)^2). If the decision is not clear, a second look takes more samples.
 
 The `energy` of the misfit uses the weights of the loss. If the misfit is constant in windows of n cells, Q(s) is n - 1
 times the sum of its squares over all cells. The energy is the largest of these sums over the scales s. The misfit then
