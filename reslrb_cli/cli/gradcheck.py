@@ -207,9 +207,9 @@ def command(**given: Any) -> int:
     """Compare the gradients of every parameter of CONFIG with references. The parameters have their initial values.
 
     Each estimator is compared with naive AD of the same paths (walk_ad), with a valid stock integrator (ptracer, else
-    prb), with finite differences, with forward mode, and with the exact value if it is known. Without CONFIG, the scene
-    is a Cornell box (--set scene.options.size=64, ...). The exit code is 1 if a comparison fails; the last lines
-    describe the failures. docs/gradcheck.md explains the columns.
+    prb), with finite differences, and with forward mode. Without CONFIG, the scene is a Cornell box
+    (--set scene.options.size=64, ...). The exit code is 1 if a comparison fails; the last lines describe the failures.
+    docs/gradcheck.md explains the columns.
     """
     began, options = time.monotonic(), GradcheckOptions(**given)
     load_packages()  # before the imports below need them

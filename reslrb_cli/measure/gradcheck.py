@@ -207,22 +207,19 @@ class Gradcheck:
         """Return the number of seeds that all samples of a comparison have."""
         return min(len(self.draws.get(name, [])) for name in self._needs(row))
 
-    def _needs(self, row: Row) -> list[Name]:
-        """Return the sample names that a comparison needs. The samples are those of the estimator and, unless the
-        reference is exact, of the reference.
-        """
+    def _needs(self, row: Row) -> tuple[Name, Name]:
+        """Return the sample names that a comparison needs: those of the estimator and of the reference."""
         naive = row.way.named("walk_ad")
         if row.key is None:
-            return [("image", naive if row.label == "reslrb" else row.label), ("image", row.reference.value)]
+            return ("image", naive if row.label == "reslrb" else row.label), ("image", row.reference.value)
         ours = "gradient", self.participants.sampled(row.label, row.reference)
         its = {
-            Reference.ANALYTIC: [],
-            Reference.WALK_AD: [("gradient", naive)],
-            Reference.FINITE_DIFFERENCE: [("differences", row.place)],
-            Reference.FORWARD_MODE: [("tangents", row.place)],
-            Reference.UNGUIDED: [("gradient", self.participants.unguided.get(row.label, row.label))],
+            Reference.WALK_AD: ("gradient", naive),
+            Reference.FINITE_DIFFERENCE: ("differences", row.place),
+            Reference.FORWARD_MODE: ("tangents", row.place),
+            Reference.UNGUIDED: ("gradient", self.participants.unguided.get(row.label, row.label)),
         }
-        return [ours, *its.get(row.reference, [("gradient", row.reference.value)])]
+        return ours, its.get(row.reference, ("gradient", row.reference.value))
 
     # --- comparing ----------------------------------------------------------------------------------------------------
 
@@ -236,8 +233,6 @@ class Gradcheck:
             return entry_count(tuple(parts.case.weights.shape))
         if row.reference in ALONG_DIRECTIONS:
             return len(parts.directions[row.place])
-        if row.reference is Reference.ANALYTIC:
-            return len(parts.exact[row.key])
         return entry_count(value_shape(parts.case.values.value(row.key)))
 
     def _compared(self, row: Row, family: Family, why: str) -> GradcheckRecord:
@@ -255,9 +250,8 @@ class Gradcheck:
         return self._record(row, figures, count)
 
     def _figures(self, row: Row, count: int, family: Family) -> Comparison:
-        parts, (mine, *its) = self.participants, self._needs(row)
-        ours, *theirs = (np.stack(self.draws[name][:count]).astype(np.float64) for name in (mine, *its))
-        reference = theirs[0] if theirs else parts.exact[str(row.key)]
+        parts = self.participants
+        ours, reference = (np.stack(self.draws[name][:count]).astype(np.float64) for name in self._needs(row))
         shape, bias, rounding = None, np.zeros(1), ROUNDING
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
@@ -266,7 +260,7 @@ class Gradcheck:
             ours, rounding = ours[:, place], parts.case.rounding(row.key)
             if row.reference in ALONG_DIRECTIONS:
                 ours = ours @ np.array([direction.vector[place] for direction in chosen]).T
-            elif its:
+            else:
                 reference, shape = reference[:, place], value_shape(parts.case.values.value(row.key))
             if row.reference is Reference.FINITE_DIFFERENCE:
                 bias = np.array([direction.truncation for direction in chosen])

@@ -1,5 +1,5 @@
-"""Results from the samples of a session: errors of averages of n steps, their slope, efficiency, the time for a given
-error, and biases.
+"""Results from the samples of a session: errors of averages of n steps, efficiency, the time for a given error,
+and biases.
 
 Samples x are (R, P): R steps, P entries. The reference r is the mean of K rows (K, P). The rows are independent
 estimates of the same mean, from other steps. tr is the trace of a covariance, which is the sum of all entries'
@@ -59,9 +59,6 @@ _UNSEEN = "nothing exceeds the reference's noise"
 
 #: Confidence level of all intervals.
 CONFIDENCE = 0.95
-
-#: Minimum number of steps for a slope.
-FEWEST_FOR_SLOPE = 16
 
 
 @dataclass(frozen=True)
@@ -156,22 +153,6 @@ class MethodSamples:
         value = np.log(squared / reference.signal) - 1
         found = jackknife(value + own / squared, value + other / squared).exponential()
         return float(np.sqrt(found.low)), float(np.sqrt(found.high))
-
-    def slope(self) -> float | None:
-        """Return d log RMSE / d log time, or None if there are too few steps. The slope is about -1/2 for independent,
-        unbiased steps.
-
-        The fit weights the error for each average length by the number of averages of that length.
-        """
-        known = [
-            (steps, len(averages), squared)
-            for steps, averages, squared in self._levels()
-            if len(averages) >= FEWEST_AVERAGES and squared > 0
-        ]
-        if self.count < FEWEST_FOR_SLOPE or len(known) < 2:
-            return None
-        steps, repeats, squared = np.transpose(known)
-        return float(0.5 * np.polyfit(np.log(steps), np.log(squared), 1, w=np.sqrt(repeats))[0])
 
     def efficiency(self) -> JackknifeEstimate | None:
         """Return the logarithm of 1 / ((variance + squared bias) * seconds of a step). Without noise or with too few
@@ -384,7 +365,6 @@ class Judgement:
             step_s=samples.step_s,
             relative_rmse=float(np.sqrt(samples.variance)),
             reference_rmse=samples.reference.floor,
-            slope=samples.slope(),
             efficiency=None if efficiency is None else efficiency.exponential(),
             efficiency_freedom=None if efficiency is None else efficiency.freedom,
             bias=float(np.sqrt(magnitude.squared_bias)) if biased else None,

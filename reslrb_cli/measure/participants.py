@@ -26,7 +26,6 @@ from reslrb_cli.measure.references import (
     Situation,
     choose,
     ends,
-    known_gradient,
     of_gradient,
     of_image,
 )
@@ -156,7 +155,7 @@ class Participants:
         but `OF_LIGHT_PATHS` are compared with the estimator's light paths (`way`). Dictionaries "by way" have names for
         each kind of paths (`Way.named`).
     - `stock` has the stock reference for each parameter's gradient, or None, and the reasons against the others.
-    - `images` has the same of the image for each way. `exact` has gradients in closed form.
+    - `images` has the same of the image for each way.
     - `listed` has the estimators that take part. If derivatives are attached, only estimators with attached derivatives
         on light paths take part.
     - `unguided` has the integrator of the unguided steps, by the label of each estimator that a run would or may guide.
@@ -208,9 +207,6 @@ class Participants:
         self._weigh(self._are_unlike([*self.stock.values(), *self.images.values()]))
         along = all_directions(self.case, problem.selection, MOVING_DIRECTIONS, DIRECTIONS)
         self.directions = {way.named(key): list(along[key]) for way in self.each_way for key in self.case.keys}
-        weights = np.array(self.case.weights, np.float64)
-        known = {key: known_gradient(self._situation, self.sensor, key, weights) for key in self.case.keys}
-        self.exact = {key: value for key, value in known.items() if value is not None}
 
     # --- integrators --------------------------------------------------------------------------------------------------
 
@@ -340,7 +336,6 @@ class Participants:
             return [Reference.FINITE_DIFFERENCE]
         stock, _ = self.stock[self.way(listed, Reference.PTRACER).named(key)]
         found = [Reference.WALK_AD] + ([] if stock is None else [stock])
-        found += [Reference.ANALYTIC] if key in self.exact else []
         found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
         return found + ([Reference.UNGUIDED] if listed.label in self.unguided else [])
 

@@ -5,7 +5,7 @@ each. A function that checks a reference returns the reason against the referenc
 The section Baselines of docs/method.md explains the reasons.
 
 Light tracing loses light along the film's border, from samples just outside of the film. Images with camera paths lose
-no light there. `known_gradient` recognises scenes with a known gradient in closed form.
+no light there.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.measure.gradients import moves_light
-from reslrb_cli.measure.scenes.analytic import furnace
 from reslrb_cli.optimization.loading import lit_emitters
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.records.measurements import Reference
@@ -30,38 +29,6 @@ from reslrb_cli.scene.upsampling import values_of
 
 #: References that trace paths from the sensor.
 CAMERA_PATHS = (Reference.PRB, Reference.PATH)
-
-
-def known_gradient(at: Situation, sensor: mi.Sensor, key: str, weights: np.ndarray) -> np.ndarray | None:
-    """Return the gradient of sum(image * weights) by `key` as a flat array, or None if there is no closed form.
-
-    The furnace has a closed form. The furnace is a sphere around the sensor, with constant emission and constant
-    diffuse reflectance. `weights` are (H, W, C).
-    """
-    shapes, emitters = at.graph.shapes(), at.scene.emitters()
-    if len(shapes) != 1 or len(emitters) != 1 or shapes[0].class_name() != "Sphere" or weights.shape[2] != 3:
-        return None
-    if mi.is_spectral:
-        return None
-    bsdf, emitter = mi.traverse(shapes[0].bsdf()), mi.traverse(emitters[0])
-    uniform = "reflectance.value" in bsdf and shapes[0].bsdf().class_name() == "SmoothDiffuse" and (
-        "radiance.value" in emitter and emitters[0].class_name() == "AreaLight"
-    )  # fmt: skip
-    if not uniform or at.hide_emitters or (at.view.smooth, at.view.emission) != (1, 1):
-        return None
-    box, origin = shapes[0].bbox(), np.array(mi.traverse(sensor)["to_world"].translation()).ravel()
-    is_inside = np.linalg.norm(origin - np.array(box.center()).ravel()) < np.array(box.extents()).min() / 2
-    if float(sensor.film().rfilter().radius()) > 0.5 or not is_inside:
-        return None
-    rho, Le = (np.array(value).ravel() for value in (bsdf["reflectance.value"], emitter["radiance.value"]))
-    if at.max_depth == -1 and np.any(rho >= 1):
-        return None
-    names = {".reflectance.value": "albedo", ".radiance.value": "emission"}
-    name = next((name for end, name in names.items() if key.endswith(end)), None)
-    if name is None:
-        return None
-    gradient = furnace(rho, Le, at.max_depth, 1).derivatives[name][0, 0] * weights.sum((0, 1))
-    return gradient if np.array(at.params[key]).size == 3 else np.array([gradient.sum()])
 
 
 #: Longest paths without roulette; naive AD of stock integrators keeps all segments.

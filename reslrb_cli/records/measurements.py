@@ -157,7 +157,6 @@ class MethodRecord(Bias, Line):
     - `relative_rmse` is the error of one step, computed from the variance of the steps. `step_s` is the number of
         seconds per step.
     - `cold_s` are the seconds of the first step in a new process, including compilation.
-    - `slope` is d log error / d log seconds.
     - `efficiency` is 1 / ((relative variance + squared relative bias) * seconds). `efficiency_freedom` are the degrees
         of freedom of its interval.
     - `bias` is the relative bias, if there is one.
@@ -178,7 +177,6 @@ class MethodRecord(Bias, Line):
     cold_s: float | None = None
     relative_rmse: float | None = None
     reference_rmse: float | None = None
-    slope: float | None = None
     efficiency: Range | None = None
     efficiency_freedom: float | None = None
     bias: float | None = None

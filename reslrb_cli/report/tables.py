@@ -170,7 +170,6 @@ FIGURES = (
     ("step_s", "step s", 8),
     ("repeats", "steps", 5),
     ("relative_rmse", "error", 8),
-    ("slope", "slope", 7),
     ("efficiency", "efficiency", 24),
     ("bias_z", "max |z| (limit)", 16),
 )

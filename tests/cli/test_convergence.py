@@ -40,7 +40,6 @@ def test_a_scene_end_to_end(folder: Path) -> None:
         assert abs(line["bias_z"]) < line["bias_z_limit"]
         assert line["efficiency"]["low"] < line["efficiency"]["value"] < line["efficiency"]["high"]
         assert line["efficiency"]["value"] == pytest.approx(1 / (line["relative_rmse"] ** 2 * line["step_s"]))
-        assert abs(line["slope"] + 0.5) < 0.2
         assert list(line["seconds_to"]) == [f"{target:g}" for target in TARGETS]
         assert line["cold_s"] > line["step_s"] > 0
     points = [line for line in lines if line["kind"] == "point" and line["label"] == names[0]]
@@ -63,8 +62,6 @@ def test_the_loss_reveals_correlated_samples(folder: Path) -> None:
     sentence = done("convergence", "tiny.yaml", *args, "--integrators", cases).stdout.splitlines()[-1]
     methods = [line for line in measured(folder / "c.jsonl") if line["kind"] == "method"]
     assert [(line["adjoint"], line["biased"]) for line in methods] == [("correlated", True), ("independent", False)]
-    assert methods[0]["slope"] > -0.4
-    assert -0.65 < methods[1]["slope"] < -0.4
     assert methods[0]["bias"] > 0.1
     assert "Best for this scene: reslrb:stack(adjoint=independent); of all others a bias was found." in sentence
 

@@ -94,7 +94,7 @@ FURNACE = str(Path(__file__).parents[2] / "configs/furnace.yaml")
 
 
 @pytest.mark.long
-def test_correct_integrators_of_mitsuba_hold(capsys: pytest.CaptureFixture[str]) -> None:
+def test_correct_integrators_of_mitsuba_hold() -> None:
     Path("mine.py").write_text(MITSUBAS)
     Path("scene.xml").write_text(room(MIXED))
 
@@ -104,7 +104,6 @@ def test_correct_integrators_of_mitsuba_hold(capsys: pytest.CaptureFixture[str])
         return ended(*words, "--seeds", "24", "--spp", "64")
 
     assert check(FURNACE, "BasicPRBIntegrator") == 0
-    assert "analytic" in capsys.readouterr().out
     assert check("room.yaml", "DirectProjectiveIntegrator", "integrator.max_depth=2") == 0
 
 

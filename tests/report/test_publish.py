@@ -170,7 +170,7 @@ def test_records_become_arrays_and_figures(tmp_path):
             method=method, parameter="image", status=BenchStatus.OK, efficiency=Range(2.0, 1.5, 2.5), biased=True
         ),
     ]
-    (found,) = zip(*(rl.table(records)[name] for name in ("efficiency_low", "biased", "slope")), strict=True)
+    (found,) = zip(*(rl.table(records)[name] for name in ("efficiency_low", "biased", "bias")), strict=True)
     assert found[:2] == (1.5, 1.0)
     assert np.isnan(found[2])
     assert rl.table(records, "point")["high"].tolist() == [1.1, 0.55, 0.275]
