@@ -26,7 +26,7 @@ from reslrb_cli.records.checkpoint import (
     newest_checkpoint,
 )
 from reslrb_cli.records.decisions import Scaled
-from reslrb_cli.records.images import load_image, write_image, write_mask, write_parameters
+from reslrb_cli.records.images import load_image, write_file, write_image, write_mask, write_parameters
 from reslrb_cli.records.manifest import Manifest, Status
 from reslrb_cli.records.measurement_files import LivePage
 from reslrb_cli.records.measurements import incomplete_records
@@ -295,6 +295,12 @@ class Recording:
         for key, shown in self.course.certainty.shown.items():
             if key not in self.problem.masks:  # `_begin` has written the masks of the problem
                 write_mask(self.folder.parameters, key, shown)
+        for view in self.problem.views:
+            path = self.folder.images / f"{self._image_name('misfit', view.sensor)}.exr"
+            if view.sensor in self.course.certainty.misfits:
+                write_file(path, self.course.certainty.misfits[view.sensor], linear=True)
+            else:
+                path.unlink(missing_ok=True)  # an earlier end of this run may have written it
 
     def _measure_seen_errors(self) -> None:
         self.seen = finite(seen_errors(self.folder.path, self.manifest.views))

@@ -27,6 +27,7 @@ from reslrb_cli.api import experiment as experiment_module
 from reslrb_cli.errors import ExitCode, MachineError, NonFinite
 from reslrb_cli.optimization import sensitivity
 from reslrb_cli.optimization.uncertainty import measuring
+from reslrb_cli.records.images import load_image
 from reslrb_cli.records.lock import FolderLock
 from reslrb_cli.runs import recorder as recording
 
@@ -65,6 +66,20 @@ def test_a_loop_ends_with_the_warnings_of_the_run(
     assert any("not converged, still moving" in line for line in warnings)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert said[-len(warnings) :] == warnings
+
+
+def test_the_map_of_a_misfit_is_that_of_the_last_end(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = np.full((2, 3, 1), -0.3, np.float32)
+
+    def measure(self: measuring.Certainty, iterations: int, *_: object) -> None:
+        self.misfits = {0: shown} if iterations == 20 else {}
+
+    monkeypatch.setattr(measuring.Certainty, "measure", measure)
+    list(rl.optimize("tiny.yaml", "runs/a", overrides={"run.iterations": 20}))
+    path = Path("runs/a/images/misfit.exr")
+    np.testing.assert_allclose(load_image(path), shown)
+    list(rl.optimize(resume="runs/a", overrides={"run.iterations": 21}))
+    assert not path.exists()
 
 
 def values_equal(first: dict[str, Any], second: dict[str, Any]) -> bool:

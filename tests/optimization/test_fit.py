@@ -62,6 +62,36 @@ def test_no_random_signs_are_as_rare_as_a_large_misfit():
     assert fit.compare(fit.cells_of(3 + random.normal(size=(16, 16, 3)), 1), random).p == 1 / (fit.FLIPS + 1)
 
 
+@pytest.mark.parametrize("kind", NOISE)
+def test_a_map_shows_a_misfit_and_no_noise(kind: str):
+    """The middle of an image is too bright by as much as the noise of a pixel. The map has its place and its size."""
+    random, shape, target = np.random.default_rng(5), (48, 64, 3), 5.0
+    variance = np.mean([NOISE[kind](random, shape) ** 2 for _ in range(100)], axis=0)
+    middle, far = np.s_[16:32, 20:44], np.ones(shape[:2], dtype=bool)
+    far[8:40, 10:54] = False
+    size = float(np.sqrt(variance[middle].mean()))
+    alarms, shares, around = 0, [], []
+    for _ in range(20):
+        residual = NOISE[kind](random, shape)
+        alarms += bool(np.any(fit.misfit_map(residual, variance, np.full(shape, target), 1)))
+        residual[middle] += size
+        found = fit.misfit_map(residual, variance, np.full(shape, target), 1)[:, :, 0]
+        shares.append(np.median(found[middle]) * target / size)
+        around.append(np.mean(found[far] != 0))
+    assert alarms <= 1  # 0.2 are expected
+    assert 0.8 < np.mean(shares) < 1.1
+    assert np.mean(around) < 0.1
+
+
+def test_a_map_leaves_out_pixels_without_a_residual_and_shows_the_sign():
+    random, shape = np.random.default_rng(6), (24, 24, 3)
+    residual = 0.01 * random.normal(size=shape) - 0.5
+    residual[:, :8] = 0.0
+    found = fit.misfit_map(residual, np.full(shape, 1e-4), np.ones(shape), 2)[:, :, 0]
+    assert np.all(found[:, :8] == 0)
+    np.testing.assert_allclose(found[:, 8:], -0.5, atol=0.02)
+
+
 @pytest.mark.parametrize(("side", "lattice"), [(24, 1), (25, 1), (200, 1), (210, 3)])
 def test_the_energy_is_that_of_the_misfit(side: int, lattice: int):
     """It does not depend on the size of the image, or on the lattice."""
@@ -206,7 +236,7 @@ def test_pixels_that_are_compared(name: str, file: str | None, right: int, llvm)
 
 def test_a_model_that_fits_is_tested_no_further():
     """Neither scene nor curvature is needed."""
-    found = candidates.judge_fit(None, fit.Fit(0.02, 1.0, 1.0, 1.0, [], []), None, lambda: True)
+    found = candidates.judge_fit(None, fit.Fit(0.02, 1.0, 1.0, 1.0, [], [], []), None, lambda: True)
     assert (found.p, found.is_significant, found.candidates) == (0.02, False, [])
 
 
@@ -215,7 +245,7 @@ def test_parameters_that_explain_little_are_not_named(monkeypatch: pytest.Monkey
     tested = [(fall, p, fit.Candidate(key, p, 0.0, [1.0], [])) for key, fall, p in found]
     monkeypatch.setattr(candidates, "_find_candidates", lambda *_: tested)
     known = types.SimpleNamespace(biases=[])
-    record = candidates.judge_fit(None, fit.Fit(0.002, 20.0, 20.0, 20.0, [], []), known, lambda: True)
+    record = candidates.judge_fit(None, fit.Fit(0.002, 20.0, 20.0, 20.0, [], [], []), known, lambda: True)
     assert {each.key: each.explained for each in record.candidates} == pytest.approx({"a": 0.5, "b": 0.06})
 
 
@@ -225,8 +255,12 @@ def test_noise_shows_no_further_parameter():
     assert np.sum(np.array(found) < 0.01) <= 7  # 2 are expected
 
 
-def recovered(folder: Path, right: str, wrong: str, parameters: list[str], **settings: str) -> CertaintyRecord:
-    """Recover `parameters` of the corner whose picture has the text `right` where the model has `wrong`."""
+def recovered(
+    folder: Path, right: str, wrong: str, parameters: list[str], **settings: str
+) -> tuple[CertaintyRecord, dict[int, np.ndarray]]:
+    """Recover `parameters` of the corner whose picture has the text `right` where the model has `wrong`. Return the
+    certainty and the misfit maps.
+    """
     config = {
         "variant": "llvm_ad_rgb", "scene": {"file": "scene.xml"}, "target": {"render": {"spp": 1024}},
         "integrator": {"type": "reslrb", "max_depth": 3}, "optimizer": {"type": "auto"},
@@ -248,29 +282,32 @@ def recovered(folder: Path, right: str, wrong: str, parameters: list[str], **set
     after = {key: np.array(value) for key, value in mi.traverse(problem.scene) if "alpha" in key}
     assert before
     assert before == after  # the tests of further parameters change none of them
-    return found
+    return found, certainty.misfits
 
 
 ALPHA = 'name="alpha" value="0.2"'
 
 
 def test_a_wrong_roughness_is_named(tmp_path, llvm):
-    found = recovered(tmp_path, ALPHA.replace("0.2", "0.5"), ALPHA, SURFACES[:1])
+    found, maps = recovered(tmp_path, ALPHA.replace("0.2", "0.5"), ALPHA, SURFACES[:1])
     assert found.parameters[SURFACES[0]].verdict == MISFIT
     assert found.fit is not None
     first = found.fit.candidates[0]
     assert first.key == "ball.bsdf.alpha"
     assert first.value == pytest.approx([0.2])
     assert 0.35 < first.proposed[0] < 0.75
-    right = recovered(tmp_path, ALPHA, ALPHA, SURFACES[:1])
+    assert list(maps) == [0]
+    assert 0.01 < np.mean(maps[0] != 0) < 0.5  # the ball
+    right, maps = recovered(tmp_path, ALPHA, ALPHA, SURFACES[:1])
     assert right.parameters[SURFACES[0]].verdict == "settled"
     assert right.fit is not None
     assert not right.fit.is_significant
     assert not right.fit.candidates
+    assert not maps
 
 
 def found_fit(p: float) -> fit.Fit:
-    return fit.Fit(p, 0.0, 1.0, 1.0, [], [])
+    return fit.Fit(p, 0.0, 1.0, 1.0, [], [], [])
 
 
 @pytest.mark.parametrize(("ps", "looks", "right"), [
@@ -354,9 +391,11 @@ def test_the_second_look_has_four_times_the_images(monkeypatch: pytest.MonkeyPat
 
 def test_images_have_half_of_the_time(monkeypatch: pytest.MonkeyPatch):
     seconds: list[float] = []
-    monkeypatch.setattr(measuring, "measure_fit", lambda problem, curvature, go_on: seconds.append(go_on._seconds))
+    monkeypatch.setattr(measuring, "measure_fit", lambda problem, curvature, go_on: (seconds.append(go_on._seconds),
+                                                                                     found_fit(0.1))[1])  # fmt: skip
     monkeypatch.setattr(candidates, "judge_fit", lambda problem, fit, known, go_on: seconds.append(go_on._seconds))
     certainty = object.__new__(measuring.Certainty)
     certainty.problem = stub()
+    certainty.problem.trained = []
     certainty._test_fit(types.SimpleNamespace(first=None), 10.0, lambda: False)
     assert seconds == [5.0, 10.0]

@@ -25,7 +25,7 @@ from report.measured import (
 )
 
 from reslrb_cli.records.decisions import Decision
-from reslrb_cli.records.images import read_layers, read_parameters
+from reslrb_cli.records.images import read_layers, read_parameters, write_file
 from reslrb_cli.records.manifest import Status, read_manifest
 from reslrb_cli.report import page as page_module
 from reslrb_cli.report.page import render, write_page, write_report
@@ -232,6 +232,20 @@ def test_a_model_that_does_not_fit_has_a_command(tmp_path):
     told = page_of(folder).sections["Parameters"]
     assert "- {key: ball.alpha, bounds: [0.02, 1]}" in told
     assert told.strip().endswith(f"reslrb optimize {folder} --free ball.alpha")
+
+
+@pytest.mark.parametrize("is_significant", [True, False])
+def test_a_map_shows_where_the_misfit_is(tmp_path, is_significant):
+    """A map of an earlier end of the run is not shown beside a model that fits."""
+    fit = {"p": 0.002, "misfit": 0.06, "energy": 1.0, "is_significant": is_significant, "candidates": []}
+    folder = make_run(tmp_path / "lamp", results={"certainty": {
+        "fit": fit, "parameters": {}, "measure_s": 1.0, "share": 0.1}})  # fmt: skip
+    values = np.zeros((24, 32, 1), np.float32)
+    values[4:8] = -0.77
+    write_file(folder / "images/misfit.exr", values, linear=True)
+    told = page_of(folder).sections["Images"]
+    assert ("red is too bright" in told) == is_significant
+    assert ("−0.8" in told) == is_significant
 
 
 def test_paths_and_their_sampling_are_reported(tmp_path):

@@ -60,6 +60,8 @@ MOST_CELLS = 64
 FLIPS, MOST_AT_ONCE = 499, 2**21
 #: Probability of a sum under noise below which it counts as energy.
 RARE = 1e-3
+#: Windows around each pixel of a map count as this many independent ones for each window that fits beside the others.
+OVERLAP = 4
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class Fit:
     """Result of the test of fit. `p` is the probability that noise looks like the residuals. `energy` is twice the loss
     of the misfit, `total` that of the whole residuals, and `size` that of black images. `slopes` are dL/dI of each view
     (H, W, C) at the final values, and `variances` their noise. The variances contain a factor for the noise that
-    neighbouring pixels share, so that all pixels may be taken as independent.
+    neighbouring pixels share, so that all pixels may be taken as independent. `maps` are the misfit maps of each view.
     """
 
     p: float
@@ -118,6 +120,7 @@ class Fit:
     size: float
     slopes: list[Array]
     variances: list[Array]
+    maps: list[Array]
 
 
 def measure_fit(problem: Problem, curvature: LossCurvature, go_on: Callable[[], bool]) -> Fit:
@@ -157,6 +160,7 @@ def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: 
     residuals = [own + part * change for own, change in zip(left, changes, strict=True)]
     judged, energy, total, size = [], 0.0, 0.0, 0.0
     variances: list[Array] = []
+    maps: list[Array] = []
     for view, residual, true, weight, of_mean in zip(problem.trained, residuals, trues, weights, of_means, strict=True):
         lattice, correlated = lattice_of(problem, view)
         noise = _noise(of_mean, true)
@@ -170,10 +174,11 @@ def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: 
         ratios = np.minimum(residual**2 / noise, MOST_RATIO)[residual != 0]
         ratio = float(ratios.mean()) if ratios.size else 0.0
         variances.append(weight**2 * ratio * noise * correlated)
+        maps.append(misfit_map(residual, ratio * noise * correlated, true, lattice))
     # Any of the views may show the misfit.
     noise = np.max([each.noise for each in judged], axis=0)
     together = Coherence(max(each.surprisal for each in judged), noise, energy)
-    return Fit(together.p, min(energy, total), total, size, slopes, variances)
+    return Fit(together.p, min(energy, total), total, size, slopes, variances, maps)
 
 
 def useful_part(residuals: Sequence[Array], changes: Sequence[Array], weights: Sequence[Array]) -> float:
@@ -184,6 +189,35 @@ def useful_part(residuals: Sequence[Array], changes: Sequence[Array], weights: S
     along = sum(float(np.sum(weight * residual * change)) for residual, change, weight in rows)
     square = sum(float(np.sum(weight * change**2)) for _, change, weight in rows)
     return float(np.clip(-along / square, 0.0, 1.0)) if square > 0 else 0.0
+
+
+def misfit_map(residual: Array, variance: Array, target: Array, lattice: int) -> Array:
+    """Return the misfit (H, W, 1) at each pixel, as a share of the target: positive where the image is too bright.
+
+    The misfit is the sum of the residual (H, W, C) over the smallest window around the pixel whose sum noise does not
+    explain, divided by that of the target. It is 0 if there is no such window. A window counts only if its middle
+    deviates in the same direction, because it may lie beside the misfit. `variance` is that of independent pixels.
+    Windows have sides of 2, 4 and so on times `lattice` pixels. Pixels without a residual do not count.
+    """
+    from scipy.ndimage import uniform_filter  # imported here, because only the end of a run needs it
+
+    kept = np.any(residual != 0, axis=2)
+    spread = np.sqrt(np.maximum(variance, 0.0)).sum(axis=2)
+    total = residual.sum(axis=2)
+    decisive = np.clip(total, -(MOST_RATIO**0.5) * spread, MOST_RATIO**0.5 * spread)  # a firefly is no misfit
+    layers = [np.where(kept, each, 0.0) for each in (decisive, spread**2, total, np.abs(target).sum(axis=2))]
+    height, width = kept.shape
+    sides = [lattice * 2**k for k in range(1 + int(np.log2(max(min(height, width) / lattice, 1))))]
+    windows = sum(max(height // side, 1) * max(width // side, 1) * OVERLAP for side in sides[1:])
+    limit = -float(special().ndtri(0.5 * LEVEL / max(windows, 1)))
+    found, is_open, middle = np.zeros((height, width)), kept, np.zeros((height, width))
+    for side in sides:
+        decisive, of_noise, total, light = (uniform_filter(each, side, mode="constant") * side**2 for each in layers)
+        z = decisive / np.sqrt(np.maximum(of_noise, 1e-300))
+        is_seen = is_open & (np.abs(z) > limit) & (np.sign(z) * middle > 1) & (light > 0)
+        found = np.where(is_seen, total / np.maximum(light, 1e-300), found)
+        is_open, middle = is_open & ~is_seen, z
+    return found[:, :, None]
 
 
 class _Images:

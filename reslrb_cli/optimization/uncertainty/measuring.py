@@ -89,6 +89,8 @@ class Certainty:
         self.last: dict[str, Array] = {}
         #: Texels (H, W) of each texture that are visible in some view and lit, once computed.
         self.shown: dict[str, Array] = {}
+        #: Maps (H, W, 1) of a significant misfit by sensor, once measured (`fit.misfit_map`).
+        self.misfits: dict[int, Array] = {}
         #: The schedule's factor for each iteration.
         self.rates: list[float] = []
 
@@ -149,7 +151,9 @@ class Certainty:
                 fit = self._test_fit(found, max(SHARE_OF_FIT * elapsed_s, LEAST_SECONDS_OF_FIT), stop)
             compiled_ms += times.codegen_ms
             fit = fit and fit.without(found.energy_of_textures(weighed))
-            if fit is not None and fit.is_significant:
+            if fit is None or not fit.is_significant:
+                self.misfits = {}
+            else:
                 wider, widest = (found.with_misfit(factor**2 * fit.energy).weighed(measured) for factor in (1, HIDDEN))
                 weighed = with_misfit(weighed, wider, widest)
             measure_s = max(clock.elapsed_s - compiled_ms / 1e3, 0.0)
@@ -178,6 +182,7 @@ class Certainty:
         try:
             go_on = _Budget(seconds, stop)
             fit = measure_fit(self.problem, found.first, _Budget(seconds / 2, stop))
+            self.misfits = {view.sensor: shown for view, shown in zip(self.problem.trained, fit.maps, strict=True)}
             return judge_fit(self.problem, fit, found.first, go_on)
         except Exception as error:
             logger.warning(f"the fit of the model was not tested: {describe(error)}")

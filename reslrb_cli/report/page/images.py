@@ -16,6 +16,7 @@ from reslrb_cli.records.images import load_image
 from reslrb_cli.report.format import number
 from reslrb_cli.report.page.layout import lay_out
 from reslrb_cli.report.sources import ShownRun
+from reslrb_cli.report.spread import misfit_words
 from reslrb_cli.report.tonemap import (
     as_png,
     color_stops,
@@ -157,7 +158,9 @@ def _row(folder: Path, suffix: str, results: Mapping[str, Any], exposure: float)
 
 
 def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[Picture]:
-    """Return the maps of |I - T| and dL/dI with their scales. Missing maps, and maps without a scale, are left out."""
+    """Return the maps of |I - T|, of dL/dI and of the misfit with their scales. Missing maps, and maps without a scale,
+    are left out.
+    """
     about = (results.get("error_maps") or {}).get(f"error{suffix}")
     layers = read_comparison(folder, suffix)
     shown = []
@@ -169,4 +172,10 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
         total = np.nan_to_num(layers["gradient"].astype(np.float64)).sum(axis=2, keepdims=True)
         caption = lay_out("titled", "∂loss/∂image", " at the end, sum over channels")
         shown.append(show_map(total, signed_end(total), "derivative of the loss", caption, signed=True))
+    misfit = load_image(folder / f"misfit{suffix}.exr") if misfit_words(results) else None
+    if misfit is not None:
+        caption = lay_out(
+            "titled", "misfit", ", as a share of the target: red is too bright; noise explains what is grey"
+        )
+        shown.append(show_map(misfit, signed_end(misfit), "misfit", caption, signed=True))
     return shown
