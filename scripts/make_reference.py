@@ -108,15 +108,22 @@ def _section(name: str, value: dict[str, Any], defs: dict[str, Any], level: int 
     yield from _table(members)
     children = {key: child for member in reversed(members) for key, child in member["properties"].items()}
     for key, child in children.items():
-        if _has_own_section(key):
+        if _has_own_section(name, key):
             yield from _section(f"{name}.{key}", child, defs, level + 1)
 
 
-def _has_own_section(key: str) -> bool:
-    """Return whether a key's section has its own heading. The type of other keys describes their sections.
-    `target.render.integrator` equals `integrator`.
+def _has_own_section(name: str, key: str) -> bool:
+    """Return whether the section of a key of the section `name` has its own heading. The type of other keys describes
+    their sections. `target.render.integrator` equals `integrator`, and the response of a view that of `target`.
     """
-    return key in ("render", "heightmap", "motion", "mask", "regularizers", "white_balance")
+    return (name, key) == ("target", "response") or key in (
+        "render",
+        "heightmap",
+        "motion",
+        "mask",
+        "regularizers",
+        "white_balance",
+    )
 
 
 def _members(value: dict[str, Any], defs: dict[str, Any]) -> list[dict[str, Any]]:

@@ -55,6 +55,7 @@ from reslrb_cli.scene import (
 )
 from reslrb_cli.scene import export as exporting
 from reslrb_cli.scene import images as pictures
+from reslrb_cli.scene import response as responses
 
 #: Expressions. Names are those of modules here.
 CALLS = """
@@ -157,7 +158,7 @@ values.resample(np.arange(12.0, dtype=np.float32).reshape(2, 2, 3), (4, 3)), val
 exporting._free(Path("/other/B.png"), Path("/h"), {"assets/b.png"}), exporting._free(Path("/other/c.png"), Path("/h"), set())
 [exporting.same_values(*pair) for pair in ((1.0, 1.000009), (1.0, 1.0001), (np.ones(3), 1.0), (np.array([1, 2.0]), 1.0), (None, None), (np.ones(2), np.ones(3)), (0.0, 1e-36))]
 [pictures.turn(np.arange(6).reshape(2, 3), n) for n in range(1, 9)]
-pictures.decode_srgb(np.array([-0.1, 0.0, 0.04, 0.04045, 0.0405, 0.5, 1, 2]))
+responses.decode_srgb(np.array([-0.1, 0.0, 0.04, 0.04045, 0.0405, 0.5, 1, 2]))
 [pictures.find_colours(names) for names in (["B", "G", "R"], ["Y"], ["x"], ["a.r", "a.g", "a.b", "Z"], ["a.R", "a.G", "a.B", "b.RGBA.R", "b.RGBA.G", "b.RGBA.B"], ["Y", "A"])]
 pictures.find_colours([f"{layer}.{letter}" for layer in ("a.Combined", "b.Combined") for letter in "RGB"])
 pictures.find_colours([f"{layer}.{letter}" for layer in ("a", "b") for letter in "RGB"])

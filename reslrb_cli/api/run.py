@@ -334,7 +334,7 @@ class Run:
         with held():
             course.stand()
             spp = progress_spp(problem)
-            seen = {view.sensor: view.exposed_array(problem.render(view.sensor, spp, course.done, "saved image"))
+            seen = {view.sensor: view.shown_array(problem.render(view.sensor, spp, course.done, "saved image"))
                     for view in problem.views}  # fmt: skip
         return seen
 

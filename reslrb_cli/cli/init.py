@@ -202,6 +202,7 @@ def command(
     from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.parameters import select_parameters
     from reslrb_cli.scene.proposal import find_movable_in_view, propose, write_smaller
+    from reslrb_cli.scene.response import LINEAR
     from reslrb_cli.scene.visibility import find_depth
 
     photo = None if target is None else read_stored(target, upright=True)
@@ -215,7 +216,7 @@ def command(
     film = sensor.film()
     own, whole = ((int(size[0]), int(size[1])) for size in (film.crop_size(), film.size()))
     size, is_raw = choose_size(own, photo, fixed=own != whole), bool(own_channels(film))
-    for line in () if target is None else photo_lines(target, color_space="linear" if is_raw else "auto"):
+    for line in () if target is None else photo_lines(target, response=LINEAR if is_raw else None):
         echo(line)
     reason = _why_camera(scene, sensor, hides, scene_file)
     is_integer = photo is not None and photo.white is not None

@@ -41,7 +41,7 @@ from reslrb_cli.config.optimizers import (
 )
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.run import AUTO_SHARDS, RunConfig
-from reslrb_cli.config.views import TargetConfig, ViewSpec, check_views
+from reslrb_cli.config.views import TargetConfig, ViewSpec, check_responses, check_views, fixed
 from reslrb_cli.glasses import Glass, find_glass
 
 
@@ -304,16 +304,11 @@ class Config(Section):
         return None if obstacle is None else f"{run.spp} {obstacle}"
 
     def with_exposures_fixed(self) -> Config:
-        """Return the experiment with exposures of 1 in place of recovered exposures. For callers that need only the
-        scene.
+        """Return the experiment with exposures of 1 in place of recovered exposures, and with the first response in
+        place of a recovered one. For callers that need only the scene.
         """
-        target = self.target
-        if isinstance(target.exposure, str):
-            target = target.model_copy(update={"exposure": 1.0})
-        views = self.views and [
-            view.model_copy(update={"exposure": 1.0}) if isinstance(view.exposure, str) else view for view in self.views
-        ]
-        return self.model_copy(update={"target": target, "views": views})
+        views = self.views and [fixed(view) for view in self.views]
+        return self.model_copy(update={"target": fixed(self.target), "views": views})
 
     def step_options(self, shard: bool = False) -> dict[str, Any]:
         """Return the sampling options of a gradient step. If `shard` is True, return the sampling options of one shard
@@ -351,6 +346,7 @@ class Config(Section):
             check_views(self.views, self.scene, self.target)
         elif self.target.file is None and self.target.render is None and self.scene.cameras is None:
             raise located("target", "must have exactly one of `file` and `render`, and has none")
+        check_responses(self.views, self.target)
         places: dict[tuple[str, str], int] = {}
         for i, spec in enumerate(self.parameters):
             for option, j, name in spec.objects():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -19,7 +19,8 @@ from typing_extensions import Self
 
 from reslrb_cli.config.base import ConfigPath, Count, Positive, Section, each_once, located, must, wrong
 from reslrb_cli.config.integrators import AnyIntegrator
-from reslrb_cli.config.parameters import COLOR_SPACE, ColorSpace, Value
+from reslrb_cli.config.parameters import Value
+from reslrb_cli.config.response import AnyResponse, response_of_color_space
 
 MaskKind = Literal["specular", "border", "clipped", "alpha"]
 
@@ -163,7 +164,10 @@ class TargetConfig(Section):
     file: ConfigPath | None = None
     """Target image (EXR, PNG, JPG, HDR), relative to the config file. The image is turned by its EXIF orientation,
     unless `scene.cameras` is given. With several views, set the `target` of each view instead."""
-    color_space: ColorSpace = Field(default="auto", description=f"{COLOR_SPACE} Only with `file`.")
+    response: AnyResponse | None = None
+    """Response of the camera: `srgb`, `linear`, `{gamma: NUMBER}`, or `{curve: NUMBERS}`. `{gamma: auto}` and
+    `{curve: auto}` are recovered with the parameters. All views share it, unless `views` gives a view its own. null:
+    srgb for files of 8 and 16 bits, linear for files of floats. Only for files. `color_space` is a former name."""
     truth: bool = False
     """Whether the target files show the scene with the values in its scene file, as images of another renderer do. The
     run then reports the error of each parameter. Only with files."""
@@ -182,6 +186,7 @@ class TargetConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _check_lists(cls, values: Any) -> Any:
+        values = response_of_color_space(values)
         for name in ("file", "exposure") if isinstance(values, dict) else ():
             if isinstance(values.get(name), list):
                 raise located(name, "is a list; give each view its own in `views`")
@@ -191,8 +196,8 @@ class TargetConfig(Section):
     def _check_one(self) -> Self:
         if self.file is not None and self.render is not None:
             raise located("", "must have exactly one of `file` and `render`, and has both")
-        if self.render is not None and self.color_space != "auto":
-            raise located("color_space", "has no effect on a rendered target; remove it")
+        if self.render is not None and self.response is not None:
+            raise located("response", "has no effect on a rendered target; remove it")
         if self.render is not None and self.white_balance is not None:
             raise located("white_balance", "has no effect on a rendered target; remove it")
         if self.render is not None and self.truth:
@@ -200,7 +205,7 @@ class TargetConfig(Section):
         return self
 
     def idle(self) -> set[str]:
-        return set() if self.render is None else {"color_space", "truth", "white_balance"}
+        return set() if self.render is None else {"response", "truth", "white_balance"}
 
 
 class ViewSpec(Section):
@@ -219,6 +224,12 @@ class ViewSpec(Section):
     exposure: Exposure | None = None
     """As `target.exposure`, for this view. `auto` and `per_channel` recover an exposure for this view alone. null:
     `target.exposure`."""
+    response: AnyResponse | None = None
+    """As `target.response`, for this view. `{gamma: auto}` and `{curve: auto}` recover a response for this view alone.
+    null: `target.response`."""
+
+
+Fixable = TypeVar("Fixable", TargetConfig, ViewSpec)
 
 
 def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None:
@@ -235,3 +246,29 @@ def check_views(views: list[ViewSpec], scene: Any, target: TargetConfig) -> None
         raise located("target.file", "has no effect beside `views`; give each view its own target")
     if target.render is not None and all(view.target is not None for view in views):
         raise located("target.render", "has no effect: every view has its own target")
+
+
+def check_responses(views: list[ViewSpec] | None, target: TargetConfig) -> None:
+    """Raise an error that names the key if a response cannot be recovered with the other settings."""
+    places = [("target", target)] if views is None else [(f"views[{n}]", view) for n, view in enumerate(views)]
+    for place, each in places:
+        response = each.response or target.response
+        if response is None or not response.recovered:
+            continue
+        if target.white_balance is not None:
+            reason = "cannot be combined with a recovered response; use exposure: per_channel instead"
+            raise located("target.white_balance", reason)
+        if response.recovered == "curve" and not isinstance(each.exposure or target.exposure, str):
+            owner = "target" if each.response is None else place
+            reason = "is recovered only up to a factor, and so needs a recovered exposure"
+            raise located(f"{owner}.response.curve", f"{reason}; set {place}.exposure to auto")
+
+
+def fixed(section: Fixable) -> Fixable:
+    """Return `target`, or an entry of `views`, with an exposure of 1 and the first response in place of recovered
+    ones.
+    """
+    update: dict[str, Any] = {"exposure": 1.0} if isinstance(section.exposure, str) else {}
+    if section.response is not None and section.response.recovered:
+        update["response"] = section.response.fixed()
+    return section.model_copy(update=update)

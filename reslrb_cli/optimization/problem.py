@@ -21,7 +21,7 @@ from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
 from reslrb_cli.optimization.optimizers import Optimizer
 from reslrb_cli.optimization.regularizers import Cost, Span, make_cost, spans_of
 from reslrb_cli.optimization.variables import Smoother, make_transform
-from reslrb_cli.optimization.views import SHARED, View, slope, to_tensor
+from reslrb_cli.optimization.views import SHARED, View, pixel_products, slope, to_tensor
 from reslrb_cli.records.decisions import Decision
 from reslrb_cli.records.images import luminance
 from reslrb_cli.scene.catalog import COLOUR, EMISSION
@@ -277,13 +277,19 @@ class Problem:
         return float(np.mean(losses))
 
     def on_samples(self, view: View) -> OnSamples | None:
-        """Return a callback that receives the samples' image and dL/dI in a view's step. A recovered exposure gets its
-        gradient from the samples of the view's step.
+        """Return a callback that receives the samples' image and dL/dI in a view's step. A recovered exposure and a
+        recovered response get their gradients from the samples of the view's step.
         """
-        key = view.exposure.key
-        if not key:
+        parts = [part for part in (view.exposure, view.response) if part is not None and part.key]
+        if not parts:
             return None
-        return functools.partial(view.exposure.add_gradient, self.optimizer[key], view.target.shape[2])
+
+        def add_gradients(image: mi.TensorXf, gradient: mi.TensorXf) -> None:
+            products = pixel_products(view.target.shape[2], image, gradient)
+            for part in parts:
+                part.add_gradient(self.optimizer[part.key], products)
+
+        return add_gradients
 
     def image_gradient(self, view: View, image: Array) -> Array:
         """Return dL/dI of a view's loss at an image (H, W, C), in the target's channels. It may contain non-finite

@@ -42,7 +42,7 @@ def got_worse(errors: Sequence[float], final: float) -> bool:
 
 
 #: A parameter of at most this many numbers is printed in full, a larger one by its mean and range.
-MOST_NUMBERS = 4
+MOST_NUMBERS = 6
 
 
 @dataclass

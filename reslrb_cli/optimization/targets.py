@@ -32,6 +32,7 @@ from reslrb_cli.scene.images import Photo, photo_lines, read_photo
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.rays import visible
+from reslrb_cli.scene.response import LINEAR
 from reslrb_cli.scene.values import resample
 from reslrb_cli.scene.visibility import interior, sees_specular, spread
 from reslrb_cli.transport.film import FINE, responses_of
@@ -76,7 +77,7 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
         found.left_out["nonfinite"] = photo.nonfinite
     if mask.file is not None:
         try:
-            weights = read_photo(mask.file, "linear", (width, height), are_upright(config))
+            weights = read_photo(mask.file, LINEAR, (width, height), are_upright(config))
             found.weights = weights.image.mean(axis=2)
         except ConfigError as error:
             raise ConfigError(config.source, f"{view.mask_key}.file", str(error)) from None
@@ -124,16 +125,16 @@ def make_targets(problem: Problem, say: Callable[[str], None]) -> Problem:
         film = problem.scene.sensors()[view.sensor].film()
         if view.file is None:
             continue
-        size = (int(film.crop_size()[0]), int(film.crop_size()[1]))
+        size, response = (int(film.crop_size()[0]), int(film.crop_size()[1])), view.decoded_by
         try:
             # Pure spectral colours are outside of sRGB, and have negative channels.
             photo = read_photo(
-                view.file, config.target.color_space, size, upright, nonfinite=True, signed=mi.is_spectral,
+                view.file, response, size, upright, nonfinite=True, signed=mi.is_spectral,
                 channels=own_channels(film),
             )  # fmt: skip
         except ConfigError as error:
             raise ConfigError(config.source, view.file_key, str(error)) from None
-        remarks += photo_lines(view.file, upright, config.target.color_space)
+        remarks += photo_lines(view.file, upright, response)
         image = photo.image
         if balance is not None:
             image = (image @ _adapted(balance, film).T).astype(np.float32)

@@ -25,21 +25,24 @@ from reslrb_cli.backend.memory import own_memory
 from reslrb_cli.config.optimizers import Custom, loss_keys
 from reslrb_cli.config.optimizers import Loss as LossConfig
 from reslrb_cli.config.parameters import Settings
+from reslrb_cli.config.response import Response
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import Mask, ViewSpec
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors, find_sensor
 from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, blur, l2, make_loss, weighted
+from reslrb_cli.optimization.response import RecoveredResponse
 from reslrb_cli.records.run_folder import exposed
 from reslrb_cli.scene.cameras import read_cameras, sensor_id
 from reslrb_cli.scene.parameters import Selection
+from reslrb_cli.scene.response import start
 from reslrb_cli.scene.visibility import sees_specular
 
 Array = np.ndarray[Any, Any]
 
-#: Key of an exposure shared by all views.
-SHARED = "exposure"
+#: Keys of an exposure and of a response that all views share.
+SHARED, RESPONSE = "exposure", "response"
 
 
 @dataclass
@@ -67,17 +70,21 @@ class Exposure:
             return mi.TensorXf(image.array * factor, image.shape)
         return mi.TensorXf(image.array * value, image.shape)
 
-    def add_gradient(self, leaf: Any, channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> None:
-        """Add dL/dE to the gradient of `leaf`, for an image (H, W, `channels` or more) and its dL/dI."""
-        product = first_channels(image, channels) * first_channels(gradient, channels)
-        # Excluded pixels may hold any value and have no derivative.
-        each = dr.select(first_channels(gradient, channels).array != 0, product.array, 0)
+    def add_gradient(self, leaf: Any, products: mi.Float) -> None:
+        """Add dL/dE to the gradient of `leaf`. `products` are dL/dI I by pixel and channel."""
         if dr.size_v(leaf) == 3:
-            pixel = dr.arange(mi.UInt32, dr.width(each) // 3)
-            total = mi.Color3f(*(dr.sum(dr.gather(mi.Float, each, 3 * pixel + channel)) for channel in range(3)))
+            pixel = dr.arange(mi.UInt32, dr.width(products) // 3)
+            total = mi.Color3f(*(dr.sum(dr.gather(mi.Float, products, 3 * pixel + channel)) for channel in range(3)))
         else:
-            total = dr.sum(each)
+            total = dr.sum(products)
         dr.accum_grad(leaf, total / dr.detach(leaf))
+
+
+def pixel_products(channels: int, image: mi.TensorXf, gradient: mi.TensorXf) -> mi.Float:
+    """Return dL/dI I by pixel and channel, for an image (H, W, `channels` or more) and its dL/dI."""
+    product = first_channels(image, channels) * first_channels(gradient, channels)
+    # Excluded pixels may hold any value and have no derivative.
+    return dr.select(first_channels(gradient, channels).array != 0, product.array, 0)
 
 
 def _held_out(config: Config, scene: mi.Scene, sensors: list[int]) -> set[int]:
@@ -138,6 +145,8 @@ class View:
     - `file` is the file of the target, or None if the target is rendered. `file_key` and `mask_key` are the places of
         file and mask in the configuration.
     - `per_channel` is true if the exposure is recovered for each channel.
+    - `decoded_by` is the response that decodes the file, or None for the usual encoding. `response` is the response
+        that is recovered, or None.
     - `codes` are the user's losses.
     - `blur` is the standard deviation in pixels of the blur of this iteration (`run.blur`).
     - `fixed` are the weights (H, W) without the mask of moving glass and mirrors (`follow`). `fixed` is None if no such
@@ -152,6 +161,8 @@ class View:
     exposure: Exposure = field(default_factory=Exposure)
     held_out: bool = False
     per_channel: bool = False
+    decoded_by: Response | None = None
+    response: RecoveredResponse | None = None
     file: Path | None = None
     file_key: str = "target.file"
     mask: Mask = field(default_factory=Mask)
@@ -175,8 +186,14 @@ class View:
         """
         if weights is not None and not np.all(weights == 1):
             target = np.where(np.isfinite(target), target, 0)
-        self.made = to_tensor(target)
+        self.take(to_tensor(target))
         self.weigh(weights)
+
+    def take(self, target: mi.TensorXf) -> None:
+        """Set the target (H, W, C), without weights."""
+        self.made = target
+        if self.response is not None:
+            self.response.see(target)
 
     def weigh(self, weights: Array | None) -> None:
         """Set weights (H, W) for the current target. None weights all pixels equally."""
@@ -195,12 +212,23 @@ class View:
             self.weigh(weights)
 
     def exposed(self, image: mi.TensorXf) -> mi.TensorXf:
-        """Return an image (H, W, C) without alpha, with the view's exposure."""
-        return self.exposure.applied(first_channels(image, self.target.shape[2]))
+        """Return an image (H, W, C) without alpha, with the view's exposure and the gain of its response."""
+        image = self.exposure.applied(first_channels(image, self.target.shape[2]))
+        return image if self.response is None else self.response.applied(image)
 
     def exposed_array(self, image: Array) -> Array:
-        """Return an image (H, W, C or more) with the view's exposure. Channels beyond the target's are unchanged."""
-        return exposed(image, np.array(self.exposure.now(), np.float32).ravel(), self.target.shape[2])
+        """Return an image (H, W, C or more) with the view's exposure, and the gain of its response. Channels beyond the
+        target's are unchanged.
+        """
+        image = exposed(image, np.array(self.exposure.now(), np.float32).ravel(), self.target.shape[2])
+        return image if self.response is None else self.response.scaled(image)
+
+    def shown_array(self, image: Array) -> Array:
+        """Return an image (H, W, C or more) as the view's camera would show it, to be compared with the target by eye.
+        Without a recovered response, it is the exposed image.
+        """
+        image = exposed(image, np.array(self.exposure.now(), np.float32).ravel(), self.target.shape[2])
+        return image if self.response is None else self.response.shown(image, self.target.shape[2])
 
     def compare(self, image: mi.TensorXf) -> mi.Float:
         """Return the attached loss of an image (H, W, C), with width 1. The view's exposure is applied."""
@@ -280,6 +308,7 @@ def view_records(views: list[View]) -> list[dict[str, Any]]:
             "share": view.share,
             "held_out": view.held_out,
             "exposure": view.exposure.key or view.exposure.fixed,
+            "response": None if view.response is None else view.response.key,
             "pixels": math.prod(view.target.shape[:2]),
             "left_out": 0 if view.weights is None else int((np.array(view.weights)[:, :, 0] == 0).sum()),
             "kinds": view.masked.counts(),
@@ -308,11 +337,18 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
         if is_held and own and isinstance(exposure, str):
             reason = f"has sensor {sensor}, whose own exposure no image determines; give it a number, or one "
             raise ConfigError(config.source, "run.held_out", f"{reason}exposure to all views")
+        response = target.response if spec.response is None else spec.response
+        if is_held and spec.response is not None and spec.response.recovered:
+            reason = f"has sensor {sensor}, whose own response no image determines; give it numbers, or one "
+            raise ConfigError(config.source, "run.held_out", f"{reason}response to all views")
         key = f"{SHARED}.{sensor}" if own else SHARED
         file, file_key = spec.target, "target.file" if config.views is None else f"{place}.target"
         if spec.target is None:
             named = spec.sensor
             file, file_key = images.get(sensor_id(named) if isinstance(named, str) else named), "scene.cameras"
+        if file is None and spec.response is not None:
+            raise ConfigError(config.source, f"{place}.response", "has no effect on a rendered target; remove it")
+        recovered = "" if response is None or file is None else response.recovered
         loss, codes = _make_losses(config, scene.sensors()[sensor].film())
         views.append(
             View(
@@ -321,6 +357,10 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
                 share=1.0 if is_held else spec.weight / total,
                 exposure=Exposure(key=key) if isinstance(exposure, str) else Exposure(exposure),
                 per_channel=exposure == "per_channel",
+                decoded_by=None if response is None else response.fixed(),
+                response=RecoveredResponse(recovered, RESPONSE if spec.response is None else f"{RESPONSE}.{sensor}")
+                if recovered
+                else None,
                 held_out=is_held,
                 file=file,
                 file_key=file_key,
@@ -362,8 +402,14 @@ def _make_losses(config: Config, film: mi.Film) -> tuple[Loss, list[OwnLoss]]:
 
 
 def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
-    """Let `selection` recover the unknown exposures of views."""
+    """Let `selection` recover the unknown exposures and responses of views."""
     for view in views:
+        if view.response is not None:
+            key, first = view.response.key, start(view.response.kind)
+            view.response.values = selection.factors
+            if key not in selection.factors:
+                value = mi.Float(first.astype(np.float32)) + dr.opaque(mi.Float, 0)
+                selection.add_factor(key, value, Settings(initial=first.tolist(), transform="log"))
         if not (key := view.exposure.key):
             continue
         view.exposure.values = selection.factors
@@ -408,7 +454,7 @@ def target_arrays(views: list[View]) -> dict[str, Array]:
 def set_targets(views: list[View], arrays: Mapping[str, Array]) -> None:
     """Set the targets and weights of views from the result of `target_arrays`."""
     for number, view in enumerate(views):
-        view.made = to_tensor(arrays[f"target-{number}"])
+        view.take(to_tensor(arrays[f"target-{number}"]))
         weights = f"weights-{number}"
         view.weights = to_tensor(arrays[weights]) if weights in arrays else None
         view.fixed = arrays.get(f"fixed-{number}")

@@ -383,13 +383,13 @@ class Recording:
                 image = self.problem.render(view.sensor, spp, self.done, "saved image")
             if not self.done:
                 self.initial[view.sensor] = image
-            exposed = view.exposed_array(image)
-            self._write_image(name, view.sensor, exposed)
+            shown = view.shown_array(image)
+            self._write_image(name, view.sensor, shown)
             self.course.results.see(name, view, image)
             if name == "final":
                 suffix = self._image_name("", view.sensor)
                 towards = self.problem.image_gradient(view, image)
-                about = write_error_map(self.folder.images, suffix, exposed, np.array(view.target), towards)
+                about = write_error_map(self.folder.images, suffix, shown, np.array(view.target), towards)
                 self.error_maps[f"error{suffix}"] = about
 
     def _write_image(self, name: str, sensor: int, image: np.ndarray[Any, Any]) -> None:

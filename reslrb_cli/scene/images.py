@@ -27,8 +27,10 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.files import PIXELS, open_file
+from reslrb_cli.config.response import Response
 from reslrb_cli.errors import ConfigError, is_out_of_memory, one_line
 from reslrb_cli.records.images import read_planes
+from reslrb_cli.scene.response import LINEAR, SRGB, clipped_level, decode
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile
@@ -101,7 +103,7 @@ class StoredImage:
         if not self.profile or (name := foreign_profile(self.profile)) is None:
             return self
         if self.white != 255:
-            advice = "convert it to sRGB, or set color_space: linear if its values are linear"
+            advice = "convert it to sRGB, or set response: linear if its values are linear"
             raise ConfigError(self.path, "", f"has the colour profile {name} in 16 bits; {advice}")
         colours, alpha = self.colours(), self.alpha()
         converted = _converted(colours, self.profile)
@@ -444,10 +446,10 @@ def texture_problems(path: Path) -> tuple[str, str]:
     return "", ""
 
 
-def photo_lines(path: Path, upright: bool = True, color_space: str = "auto") -> list[str]:
+def photo_lines(path: Path, upright: bool = True, response: Response | None = None) -> list[str]:
     """Return lines for the user about the EXIF orientation and the ICC profile of an image.
 
-    `upright` tells whether the image is read upright or as stored. With `color_space` linear, the profile is ignored.
+    `upright` tells whether the image is read upright or as stored. With a linear response, the profile is ignored.
     """
     with _opened(path) as header:
         turned = TURNS.get(header.orientation)
@@ -457,8 +459,8 @@ def photo_lines(path: Path, upright: bool = True, color_space: str = "auto") -> 
         lines.append(f"{path}: {turned}, as its EXIF orientation says")
     elif turned is not None:
         lines.append(f"{path}: not {turned} as its EXIF orientation says: cameras of files use the stored orientation")
-    if profile is not None and color_space == "linear":
-        lines.append(f"{path}: its colour profile {profile} is ignored, as color_space is linear")
+    if profile is not None and response == LINEAR:
+        lines.append(f"{path}: its colour profile {profile} is ignored, as the response is linear")
     elif profile is not None:
         lines.append(f"{path}: colours are converted from its profile {profile} to sRGB")
     return lines
@@ -469,7 +471,8 @@ class Photo:
     """Image file as linear Rec. 709, (H, W, 3) float32, or with the channels that were asked for. Booleans (H, W) mark
     the defects of the pixels.
 
-    `clipped` pixels have a channel at the maximum value of a file of integers. `transparent` pixels have alpha 0.
+    `clipped` pixels have a channel at the maximum value of a file of integers, or so close to it that the response does
+    not determine the light (`response.clipped_level`). `transparent` pixels have alpha 0.
     `nonfinite` pixels have a non-finite channel. `alpha` (H, W) is in [0, 1], or None. Files of floats store colours
     that are multiplied by it.
     """
@@ -492,7 +495,8 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
     Raises a ConfigError that names the file if the file is missing, no image, damaged, truncated, too large or of
     another size. Raises ConfigError also for non-finite values, and for negative values unless `signed` is true.
     """
-    image = read_photo(path, color_space, size, upright=False, signed=signed).image
+    response = None if color_space == "auto" else Response.model_validate({"encoding": color_space})
+    image = read_photo(path, response, size, upright=False, signed=signed).image
     orientation = orientation_of(path)
     if orientation > 1:
         logger.warning("%s: the stored orientation is used, not %s as its EXIF says", path, TURNS[orientation])
@@ -501,7 +505,7 @@ def read_image(path: Path, color_space: str = "auto", size: Size | None = None, 
 
 def read_photo(
     path: Path,
-    color_space: str = "auto",
+    response: Response | None = None,
     size: Size | None = None,
     upright: bool = True,
     signed: bool = False,
@@ -510,21 +514,24 @@ def read_photo(
 ) -> Photo:
     """Read an image file like `read_image`, and mark unreliable pixels.
 
+    `response` decodes the values. None is sRGB for integers, and linear for floats.
     `upright` rotates the image by its EXIF orientation. `size` then refers to the upright image. `signed` allows
     negative values, and `nonfinite` allows non-finite values. `channels` are the names of the channels to read, if the
     image is not RGB. Raises ConfigError, located in the file.
     """
     stored = read_stored(path, size, upright)
     is_integer = stored.white is not None
-    if not channels and (color_space == "srgb" or (color_space == "auto" and is_integer)):
+    response = response or (SRGB if is_integer else LINEAR)
+    if not channels and response != LINEAR:
         stored = stored.in_srgb()
     colours = stored.only(channels) if channels else stored.colours()
     alpha = None if channels else stored.alpha()
-    image = colours.astype(np.float32) / np.float32(stored.white or 1)
-    if color_space == "srgb" or (color_space == "auto" and is_integer):
-        image = decode_srgb(image)
+    image = decode(response, colours.astype(np.float32) / np.float32(stored.white or 1))
     if not channels:
         image = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
+    clipped: Image = np.zeros(image.shape[:2], dtype=bool)
+    if stored.white is not None:
+        clipped = np.any(colours >= clipped_level(response, stored.white), axis=2)
     finite = np.isfinite(image)
     for bad, what in ((~finite & (not nonfinite), "not finite"), (finite & (image < 0) & (not signed), "negative")):
         if bad.any():
@@ -534,16 +541,9 @@ def read_photo(
             raise ConfigError(path, "", f"{where}, is {value}: {what} ({count} pixels in all)")
     return Photo(
         np.ascontiguousarray(image),
-        clipped=(colours == stored.white).any(axis=2) if is_integer else np.zeros(image.shape[:2], dtype=bool),
+        clipped=clipped,
         transparent=np.zeros(image.shape[:2], dtype=bool) if alpha is None else alpha == 0,
         nonfinite=np.logical_not(finite.all(axis=2)),
         alpha=None if alpha is None else np.clip(alpha / np.float32(stored.white or 1), 0.0, 1.0),
         is_integer=is_integer,
     )
-
-
-def decode_srgb(encoded: Image) -> Image:
-    """Return the linear values of sRGB-encoded values (IEC 61966-2-1), with the precision of the input."""
-    wide = encoded.astype(np.float64)
-    curve = ((np.maximum(wide, 0) + 0.055) / 1.055) ** 2.4
-    return np.where(wide <= 0.04045, wide / 12.92, curve).astype(encoded.dtype)

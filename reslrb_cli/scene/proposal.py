@@ -23,9 +23,10 @@ from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters, own
 from reslrb_cli.scene.deformation import list_movable, where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.graph import SceneGraph
-from reslrb_cli.scene.images import StoredImage, decode_srgb
+from reslrb_cli.scene.images import StoredImage
 from reslrb_cli.scene.needs import surfaces_met
 from reslrb_cli.scene.rays import grid, sensor_rays
+from reslrb_cli.scene.response import decode_srgb
 
 Image = np.ndarray[Any, Any]
 

@@ -24,9 +24,10 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble_scene
 from reslrb_cli.records.manifest import read_manifest
 from reslrb_cli.scene.catalog import Value
-from reslrb_cli.scene.images import decode_srgb, image_size, orientation_of
+from reslrb_cli.scene.images import image_size, orientation_of
 from reslrb_cli.scene.load import load_scene
 from reslrb_cli.scene.proposal import TEXELS, _resolution, find_movable_in_view, propose, usual_bounds
+from reslrb_cli.scene.response import decode_srgb
 
 pytestmark = pytest.mark.usefixtures("llvm", "compared")
 

@@ -20,8 +20,8 @@ from reslrb_cli.errors import ConfigError
 FULL = """\
 variant: llvm_ad_rgb
 scene: {file: scene.xml, options: {resx: 64, fast: true, scale: 1e-3, text: "1e-3", no: no}}
-target: {color_space: linear}
-views: [{sensor: 2, target: t0.exr}, {sensor: 0, target: /abs/t1.png, mask: w.png}]
+target: {response: {curve: [1, 1, .9, 1.5, 2, 6e0]}}
+views: [{sensor: 2, target: t0.exr}, {sensor: 0, target: /abs/t1.png, mask: w.png, response: {gamma: auto}}]
 parameters:
   - {key: "*.reflectance.data", initial: 1, bounds: [-.inf, 1E0], learning_rate: 5e-2, resolution: [64, 32]}
   - {key: white.reflectance.value, initial: [.5, +0.5, 1], bounds: [0, .inf], transform: log}

@@ -16,8 +16,9 @@ from kit import profile_of
 
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.scene import images
-from reslrb_cli.scene.images import decode_srgb, orientation_of, photo_lines, read_image, read_photo, read_stored
+from reslrb_cli.scene.images import orientation_of, photo_lines, read_image, read_photo, read_stored
 from reslrb_cli.scene.proposal import write_smaller
+from reslrb_cli.scene.response import LINEAR, decode_srgb
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -504,8 +505,8 @@ def test_colour_profiles_are_converted(space, suffix, tmp_path):
     assert photo_lines(path) == [f"{path}: colours are converted from its profile {space} to sRGB"]
     raw = read_image(path, "linear")
     np.testing.assert_allclose(raw, values / 255, atol=0.01)
-    assert photo_lines(path, color_space="linear") == [
-        f"{path}: its colour profile {space} is ignored, as color_space is linear"
+    assert photo_lines(path, response=LINEAR) == [
+        f"{path}: its colour profile {space} is ignored, as the response is linear"
     ]
 
 
@@ -518,7 +519,7 @@ def test_profiles_of_srgb_change_nothing_and_damaged_ones_neither(tmp_path):
         Image.fromarray(values).save(tmp_path / "a.png", icc_profile=profile)
         assert np.array_equal(read_image(tmp_path / "a.png", "linear"), np.float32(values) / np.float32(255))
         np.testing.assert_allclose(read_image(tmp_path / "a.png"), decode_srgb(values / 255.0), atol=1e-6)
-        assert photo_lines(tmp_path / "a.png") == photo_lines(tmp_path / "a.png", color_space="linear") == []
+        assert photo_lines(tmp_path / "a.png") == photo_lines(tmp_path / "a.png", response=LINEAR) == []
 
 
 def test_a_profile_of_16_bits_is_refused_unless_values_are_linear(tmp_path):

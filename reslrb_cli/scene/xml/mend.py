@@ -30,7 +30,8 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.installation import is_known
-from reslrb_cli.scene.images import decode_srgb, read_stored
+from reslrb_cli.scene.images import read_stored
+from reslrb_cli.scene.response import decode_srgb
 from reslrb_cli.scene.xml.read import Description, Element, floats, is_true, quoted
 
 

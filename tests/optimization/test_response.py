@@ -1,0 +1,170 @@
+"""Recovered responses: the gain of images, its derivatives, views that share a curve, and whole recoveries of a room
+from pictures with film curves.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from kit import area, diffuse, ref, scene, sensor, shape
+from PIL import Image
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+ROOM = {"floor": (0.45, 0.30, 0.18), "back": (0.70, 0.66, 0.55), "left": (0.62, 0.12, 0.10),
+        "right": (0.15, 0.45, 0.20), "ball": (0.10, 0.18, 0.45), "ceiling": (0.85, 0.85, 0.82)}  # fmt: skip
+PLACES = {
+    "floor": '<rotate x="1" angle="-90"/><translate y="-1"/>',
+    "ceiling": '<rotate x="1" angle="90"/><translate y="1"/>',
+    "back": '<translate z="-1"/>', "left": '<rotate y="1" angle="90"/><translate x="-1"/>',
+    "right": '<rotate y="1" angle="-90"/><translate x="1"/>',
+}  # fmt: skip
+EYES = "0, 0, 3.6", "0.6, 0.3, 3.4"
+CONFIG = """
+variant: llvm_ad_rgb
+scene: {file: scene.xml}
+target: {file: photo0.png, exposure: auto}
+parameters: [PARAMETERS]
+integrator: {type: reslrb, max_depth: 8}
+loss: {type: relative_l2}
+optimizer: {type: auto}
+run: {iterations: 100, spp: 32}
+"""
+
+
+def room(colours: dict[str, tuple[float, float, float]], size: int) -> str:
+    """Return a closed room with a ball and a lamp at its ceiling."""
+    parts = [sensor(eye, size=size, fov=36) for eye in EYES]
+    for name, colour in colours.items():
+        parts.append(diffuse(", ".join(map(str, colour)), name))
+        if name == "ball":
+            place = '<scale value="0.4"/><translate x="0.3" y="-0.6"/>'
+            parts.append(shape("sphere", "sphere", ref(name), place=place))
+        else:
+            parts.append(shape("rectangle", f"{name}_wall", ref(name), place=PLACES[name]))
+    place = '<scale value="0.35"/><rotate x="1" angle="90"/><translate y="0.98" z="0.1"/>'
+    parts.append(shape("rectangle", "panel", diffuse("0, 0, 0"), area("6, 5.5, 5"), place=place))
+    return scene(*parts)
+
+
+def encoded(light: np.ndarray) -> np.ndarray:
+    """Return the sRGB values of light."""
+    light = np.clip(light, 0, 1)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def filmed(light: np.ndarray) -> np.ndarray:
+    """Return the values of a film curve by Narkowicz, which no curve of six numbers equals."""
+    return encoded(light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14))
+
+
+def write_room(folder: Path, curve=encoded, size: int = 12, spp: int = 64, suffix: str = "png") -> Path:
+    """Write the room in grey, a photograph of its true colours by each sensor, and a configuration."""
+    grey = dict.fromkeys(ROOM, (0.5, 0.5, 0.5))
+    (folder / "scene.xml").write_text(room(grey, size))
+    (folder / "true.xml").write_text(room(ROOM, size))
+    true = mi.load_file(str(folder / "true.xml"))
+    path = mi.load_dict({"type": "path", "max_depth": 8})
+    for number in range(len(EYES)):
+        light = np.array(mi.render(true, integrator=path, sensor=number, spp=spp, seed=7))
+        pixels = np.round(255 * curve(light)).astype(np.uint8)
+        Image.fromarray(pixels).save(folder / f"photo{number}.{suffix}", quality=95, subsampling=0)
+    keys = ", ".join(f"{{key: {name}.reflectance.value, bounds: [0, 1]}}" for name in ROOM)
+    (folder / "room.yaml").write_text(CONFIG.replace("PARAMETERS", keys).replace("png", suffix))
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_room(tmp_path)
+
+
+def make(folder, *sets):
+    return assemble(load(folder / "room.yaml", list(sets)))
+
+
+def with_numbers(problem, key, numbers):
+    """Return the problem at these numbers of a response."""
+    problem.optimizer.set_value(key, mi.Float(np.asarray(numbers, np.float32)) + dr.opaque(mi.Float, 0))
+    problem.apply()
+    return problem
+
+
+NUMBERS = {"{curve: auto}": [0.8, 0.9, 1.1, 1.3, 1.6, 2.5], "{gamma: auto}": [1.9]}
+
+
+@pytest.mark.parametrize("response", NUMBERS)
+def test_the_gain_is_that_of_a_known_response(folder, response):
+    """Image times gain over target is image over the target that the same numbers decode."""
+    kind, numbers = response[1:6], NUMBERS[response]
+    problem = with_numbers(make(folder, f"target.response={response}"), "response", numbers)
+    given = {"curve": numbers, "gamma": numbers[0]}[kind]
+    known = make(folder, f"target.response={{{kind}: {given}}}", "target.exposure=1").views[0]
+    view = problem.views[0]
+    image = mi.TensorXf(np.random.default_rng(0).uniform(0.1, 1, view.target.shape).astype(np.float32))
+    ratio = np.array(view.exposed(image)) / np.array(view.target)
+    expected = np.array(image) / np.array(known.target)
+    seen = np.array(view.target) > 0.004
+    assert seen.mean() > 0.5
+    np.testing.assert_allclose(ratio[seen], expected[seen], rtol=2e-3)
+    np.testing.assert_allclose(view.exposed_array(np.array(image)), np.array(view.exposed(image)), rtol=1e-4)
+    # The light of the target is shown as the target.
+    light = np.array(view.target) * np.array(image) / np.array(view.exposed(image))
+    np.testing.assert_allclose(view.shown_array(light)[seen], np.array(view.target)[seen], rtol=1e-3)
+
+
+@pytest.mark.parametrize("response", NUMBERS)
+@pytest.mark.parametrize("adjoint", ["batched", "correlated"])
+def test_derivatives_agree_with_differences(folder, response, adjoint):
+    """Those of the response and of the exposure, at common random numbers if the adjoint is correlated."""
+    sets = "target.exposure=per_channel", f"run.adjoint={adjoint}", "loss={type: l2}", "run.spp=128"
+    problem = make(folder, f"target.response={response}", *sets)
+    numbers = np.array(NUMBERS[response])
+    with_numbers(problem, "response", numbers)
+    sample_gradient(problem, problem.integrator, 0, "test", 128)
+    found = take_gradient(problem)["response"]
+
+    [view] = problem.views
+    image = mi.TensorXf(problem.render(0, 4096, 0, "test"))
+
+    def loss(offset):
+        with_numbers(problem, "response", numbers + offset)
+        return float(view.compare(image)[0])
+
+    expected = [(loss(1e-2 * unit) - loss(-1e-2 * unit)) / 2e-2 for unit in np.eye(numbers.size)]
+    np.testing.assert_allclose(found, expected, rtol=0.05, atol=0.03 * np.abs(expected).max())
+
+
+def test_views_share_a_response_or_have_their_own(folder):
+    views = "views=[{target: photo0.png}, {sensor: 1, target: photo1.png}]"
+    sets = [views, "target={exposure: auto, response: {curve: auto}}"]
+    shared = make(folder, *sets)
+    assert [view.response.key for view in shared.views] == ["response", "response"]
+    assert shared.selection.keys[-2:] == ["response", "exposure"]
+    own = views.replace("photo1.png", "photo1.png, response: {gamma: auto}")
+    problem = make(folder, own, sets[1])
+    assert [view.response.key for view in problem.views] == ["response", "response.1"]
+    assert [problem.selection.array(key).shape for key in ("response", "response.1")] == [(6,), ()]
+    fixed = make(folder, views.replace("photo1.png", "photo1.png, response: linear"), sets[1])
+    assert fixed.views[1].response is None
+    assert float(np.array(fixed.views[1].target).max()) == pytest.approx(
+        float(np.array(Image.open(folder / "photo1.png")).max()) / 255
+    )
+    # The gradient of a shared response is the sum of those of the views.
+    images = [mi.TensorXf(np.random.default_rng(n).uniform(0.1, 1, (12, 12, 3)).astype(np.float32)) for n in range(3)]
+    parts = []
+    for views in (shared.views, shared.views[:1], shared.views[1:]):
+        for view in views:
+            shared.on_samples(view)(images[view.sensor], images[2])
+        parts.append(np.array(shared.optimizer.gradient("response")))
+        shared.optimizer.clear_gradient("response")
+    np.testing.assert_allclose(parts[0], parts[1] + parts[2], rtol=1e-4)
+    assert np.abs(parts[1] - parts[2]).max() > 0
