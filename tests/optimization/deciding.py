@@ -59,8 +59,8 @@ class World:
     calls: list[Any] = field(default_factory=list)
     spent_s: float = 0.0
 
-    def learn(self, round: int, spp: int) -> Step:
-        self.calls.append(("learn", round, spp))
+    def learn(self, spp: int) -> Step:
+        self.calls.append(("learn", 0, spp))
         self.spent_s += 1e-3 * (self.walk * spp + self.python + 5.0)
         return Step(kernel_ms=self.walk * spp, wall_ms=self.walk * spp + self.python, compile_ms=5.0)
 

@@ -1,20 +1,14 @@
-"""Races between two ways to sample a gradient. A race takes steps of both ways before the first iteration.
+"""Races between two ways to sample a gradient, before the first iteration. `sampling` has the raced settings.
 
-- `compare` compares two ways of sampling a gradient. The function returns the gain in efficiency, with its interval.
-- `Turns` decides whether another way of taking steps pays. Steps of both ways alternate, and their gradients have the
-    same mean.
-- `StepTrial` takes the steps of a problem, with dL/dI fixed at one image.
-
-The module `sampling` says which settings are raced.
-
-The gain compares variance times time.
+`StepTrial` takes the steps of a problem, with dL/dI fixed at one image. `Turns` takes a fixed number of steps of both
+ways in turns, and decides. Both ways have the same mean, so the gain compares variance times time.
 
     gain = (variance * time of the one) / (variance * time of the other)
 
 The variance is a sum over the parameters. Each parameter's variance is divided by the mean square of its gradient. The
 jackknife over the steps gives the interval for the logarithm of the variance ratio. The error of single times is added.
-Times include kernels and the run's other work. The other work counts equally for both ways, and matters if iterations
-take milliseconds. If steps sample from a table, the table first learns from other paths. The table then stays fixed.
+Times include kernels and the run's other work, which counts equally for both ways. If steps sample from a table, the
+table first learns from other paths, and then stays fixed.
 """
 
 from __future__ import annotations
@@ -99,8 +93,7 @@ def measured_step(problem: Problem, integrator: Any, clock: StepClock, round: in
 
 
 def compare(
-    own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float],
-    confidence: float = CONFIDENCE,
+    own: Sequence[Gradients], own_ms: Sequence[float], other: Sequence[Gradients], other_ms: Sequence[float]
 ) -> Gain | None:  # fmt: skip
     """Return the efficiency of `other` divided by the efficiency of `own`, with the confidence interval of the ratio.
 
@@ -115,7 +108,7 @@ def compare(
     times = statistics.median(own_ms) / max(statistics.median(other_ms), 1e-6)
     advantage = math.exp(known[0][0] - known[1][0]) * times
     variance = sum(float(jackknife_variance(each[1])) for each in known if each is not None)
-    half = float(special().stdtrit(min(len(own), len(other)) - 1, (1 + confidence) / 2)) * math.sqrt(variance)
+    half = float(special().stdtrit(min(len(own), len(other)) - 1, (1 + CONFIDENCE) / 2)) * math.sqrt(variance)
     factor = math.exp(min(half, 50.0)) * TIMING_NOISE
     return advantage, advantage / factor, advantage * factor
 
@@ -140,17 +133,12 @@ def _log_variances(gradients: Sequence[Gradients], squares: dict[str, float]) ->
 
 #: Fewer rounds give no result.
 LEAST_ROUNDS = 4
-#: Planned rounds for gradients with many entries, and with few, which tell less per round.
+#: Rounds for gradients with many entries, and with few, which tell less per round.
 ROUNDS, ROUNDS_OF_FEW, FEW_ENTRIES = 8, 16, 64
-#: Maximum number of checks whether the result is clear, one after each planned number of rounds.
-LOOKS = 3
-#: Confidence needed before the last check, higher than at the end: repeated checks must not let a useless option pass.
-CLEAR = 0.99
-#: Time for the planned rounds, in steps.
+#: Time for all rounds, in steps.
 PLANNED = 3.4
-#: Samples of each walk for learning, as a share of a step's, and number of such walks before the trial if there is time
-#: for more than one.
-LEARNING_SHARE, LEARNINGS = 0.4, 2
+#: Samples of the walk for learning, as a share of a step's.
+LEARNING_SHARE = 0.6
 
 
 def lessons(problem: Problem) -> float:
@@ -167,7 +155,7 @@ class Sizes:
     """Samples per pixel. `step` is the sample count per step of the run, `call` per set with one dL/dI, and `part` per
     pass of a set.
 
-    `alone` tells whether images have their own samples. `rounds` is the planned number of rounds. `lessons` is how
+    `alone` tells whether images have their own samples. `rounds` is the number of rounds. `lessons` is how
     often tables of guided emission learn for each set, averaged over the run. A step with the option may take `longer`
     times as long as a plain step. `planned` is at most PLANNED.
     """
@@ -188,7 +176,7 @@ class Sizes:
 
     @property
     def learning(self) -> int:
-        """Samples of each learning walk."""
+        """Samples of the learning walk."""
         return max(min(int(LEARNING_SHARE * self.step), self.part), 1)
 
 
@@ -227,16 +215,16 @@ class Finding:
 
 class Turns:
     """A race. `take(other, round, spp)` takes its steps, with a learned table that stays unchanged. If a table must
-    learn, `learn(round, spp)` updates it from a walk, with seeds that no step has.
+    learn, `learn(spp)` updates it from a walk, with seeds that no step has.
 
-    The race ends after `limit_s` seconds. With `guides`, the other way is guided, and its time includes the learning of
-    the run. Otherwise, the race takes all planned rounds first, or as many as a step has samples. Steps of
+    The race ends early after `limit_s` seconds. With `guides`, the other way is guided, and its time includes the
+    learning of the run. Otherwise, the race takes all rounds in any case, or as many as a step has samples. Steps of
     milliseconds, whose time is that of Python code, are then measured, too.
     """
 
     def __init__(
         self, take: Callable[[bool, int, int], Step], sizes: Sizes, limit_s: float,
-        learn: Callable[[int, int], Step] | None = None, guides: bool = False,
+        learn: Callable[[int], Step] | None = None, guides: bool = False,
     ) -> None:  # fmt: skip
         self._spent_ms = 0.0
         self._take, self._learn, self._sizes = take, learn, sizes
@@ -251,34 +239,21 @@ class Turns:
         self._spend(take(False, 0, spp))  # compiles kernels
         plain = self._spend(take(False, 0, spp))
         # Python's time is the same for both.
-        kernels = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms)
-        if not self._learned(kernels + 2 * plain.beside_ms):
+        round_ms = (1 + self._sizes.longer) * (plain.kernel_ms + plain.image_ms) + 2 * plain.beside_ms
+        if self._learn is not None:
+            self._walk = self._spend(self._learn(self._sizes.learning))
+        if not self._affords(LEAST_ROUNDS * round_ms):
             return Finding(False, None, f"measuring it would take more than {self._limit_ms / 1e3:.2g} s", True)
         self._spend(take(True, 0, spp))
-        for round in range(1, 1 + LOOKS * self._sizes.rounds):
+        for round in range(1, 1 + self._sizes.rounds):
             for other in (False, True):
                 self._steps[other].append(self._spend(take(other, round, spp)))
             if not self._affords(sum(steps[-1].wall_ms for steps in self._steps)):
-                found = self._decided()
-                if found.gain is not None and found.gain[1] <= 1 <= found.gain[2]:
-                    return replace(found, note=f"not decided in {self._limit_ms / 1e3:.2g} s", is_open=True)
-                return found
-            # No more steps are needed if the other way is clearly better, or clearly not better.
-            if round % self._sizes.rounds == 0 and ((gain := self._gain(CLEAR)) is None or not gain[1] <= 1 <= gain[2]):
                 break
-        return self._decided()
-
-    def _learned(self, round_ms: float) -> bool:
-        """Let the table learn if it must. Returns False if the time does not suffice for learning and for the minimum
-        number of rounds of `round_ms` each.
-        """
-        rounds = max(self._sizes.rounds // 2, LEAST_ROUNDS)
-        for number in range(LEARNINGS if self._learn is not None else 0):
-            # One more walk gains little compared with the uncertainty of too few rounds.
-            if number and not self._affords(self._walk.wall_ms + rounds * round_ms):
-                break
-            self._walk = self._spend(self._learn(number, self._sizes.learning))  # type: ignore[misc]  # not None
-        return self._affords(LEAST_ROUNDS * round_ms)
+        found = self._decided()
+        if round < self._sizes.rounds and found.gain is not None and found.gain[1] <= 1 <= found.gain[2]:
+            return replace(found, note=f"not decided in {self._limit_ms / 1e3:.2g} s", is_open=True)
+        return found
 
     def _affords(self, more_ms: float) -> bool:
         return len(self._steps[True]) < self._sure or self._spent_ms + more_ms <= self._limit_ms
@@ -296,10 +271,10 @@ class Turns:
         beside += self._learning_ms() if other and self._guides else 0.0
         return [step.kernel_ms + beside for step in steps]
 
-    def _gain(self, confidence: float = CONFIDENCE) -> Gain | None:
+    def _gain(self) -> Gain | None:
         """Return the gain in efficiency for the gradient."""
         own, other = ([step.gradients for step in steps] for steps in self._steps)
-        return compare(own, self._times(False), other, self._times(True), confidence)
+        return compare(own, self._times(False), other, self._times(True))
 
     def _image_gain(self) -> Gain | None:
         """Return the gain in efficiency for the image, from the samples of the gradient or from its own samples."""
@@ -365,20 +340,17 @@ class StepTrial:
         image = render_image(self._tracers[False], self._problem.scene, view.sensor, self._seed(0, view, "image"), spp)
         return to_tensor(finite(slope(view.objective, np.array(image))))
 
-    def learn(self, round: int, spp: int) -> Step:
+    def learn(self, spp: int) -> Step:
         """Let the table learn, and prepare it for sampling. It stays unchanged from then on.
 
-        The first call does all work twice, and drops the first result. The learning time then excludes compilation and
-        recording.
+        All work is done twice, and the first result is dropped. The learning time then excludes compilation.
         """
-        jobs = [self._job(view, self._seed(round, view, "learned from"), spp) for view in self.views]
-        compile_ms = 0.0
+        jobs = [self._job(view, self._seed(0, view, "learned from"), spp) for view in self.views]
         assert self.table is not None
-        if not self.table.learned:
-            compile_ms = self._teach(self.table, jobs).wall_ms
-            self.table.forget()
+        first = self._teach(self.table, jobs)
+        self.table.forget()
         taken = timed(self._teach(self.table, jobs))
-        taken.compile_ms += compile_ms
+        taken.compile_ms += first.wall_ms
         return taken
 
     def _teach(self, table: Guiding, jobs: list[Job]) -> StepTimes:
