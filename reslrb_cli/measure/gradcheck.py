@@ -217,7 +217,6 @@ class Gradcheck:
             Reference.WALK_AD: ("gradient", naive),
             Reference.FINITE_DIFFERENCE: ("differences", row.place),
             Reference.FORWARD_MODE: ("tangents", row.place),
-            Reference.UNGUIDED: ("gradient", self.participants.unguided.get(row.label, row.label)),
         }
         return ours, its.get(row.reference, ("gradient", row.reference.value))
 
@@ -266,7 +265,7 @@ class Gradcheck:
                 bias = np.array([direction.truncation for direction in chosen])
         if row.kind is Kind.EQUAL_SEEDS:
             return compare_equal_seeds(ours, reference, rounding)
-        if shape is not None and row.reference not in (Reference.WALK_AD, Reference.UNGUIDED):
+        if shape is not None and row.reference is not Reference.WALK_AD:
             rounding = max(rounding, STOCK_ROUNDING)
         return compare_expectations(ours, reference, family, shape=shape, bias=bias, rounding=rounding)
 

@@ -157,7 +157,8 @@ def all_estimators(config: Config) -> list[NamedIntegrator]:
     """Return every estimator of `reslrb`. The estimator that the configuration selects keeps the options from the
     configuration.
 
-    All estimators use light paths. If `paths` is `auto`, a case with both kinds of paths is added.
+    All estimators use light paths. If `paths` is `auto`, a case with both kinds of paths is added, and if `guiding` is
+    `auto`, a case with guided paths.
     """
     cases, own = [], config.integrator
     camera = isinstance(own, ReslrbConfig) and own.paths == "camera"  # only `stack` has camera paths
@@ -169,8 +170,13 @@ def all_estimators(config: Config) -> list[NamedIntegrator]:
             text = ",".join(f"{option}={value}" for option, value in options.items())
             label = f"reslrb:{name}({text})" if text else f"reslrb:{name}"
             cases.append(NamedIntegrator(label, "reslrb", {"estimator": name} | options))
-    if isinstance(own, ReslrbConfig) and own.paths == "auto":
-        cases.append(NamedIntegrator("reslrb:stack(paths=both)", "reslrb", {"estimator": "stack", "paths": "both"}))
+    more = {"paths": "both", "guiding": "on"} if isinstance(own, ReslrbConfig) else {}
+    for option, value in more.items():
+        # Views with different lamps cannot share tables, and camera paths alone use none.
+        without = option == "guiding" and (camera or config.names_lamps)
+        if getattr(own, option) == "auto" and not without:
+            options = {"estimator": "stack", option: value}
+            cases.append(NamedIntegrator(f"reslrb:stack({option}={value})", "reslrb", options))
     return cases
 
 

@@ -62,9 +62,6 @@ OF_LIGHT_PATHS = (Reference.WALK_AD, Reference.PTRACER, Reference.PRB, Reference
 #: Integrator of the differenced images: ours, without roulette if paths have a maximum length.
 DIFFERENCED = "differenced"
 
-#: Steps that update tables before guided and unguided steps are compared.
-LESSONS = 8
-
 #: Seeds for choosing the step of finite differences.
 PILOT_SEEDS = 2
 
@@ -158,7 +155,6 @@ class Participants:
     - `images` has the same of the image for each way.
     - `listed` has the estimators that take part. If derivatives are attached, only estimators with attached derivatives
         on light paths take part.
-    - `unguided` has the integrator of the unguided steps, by the label of each estimator that a run would or may guide.
     - `forward_mode` tells whether there is a forward mode. Moving emitters have none.
     - `masked` tells whether images and their references leave out the film's border.
     - `lit` has the indices of the emitters that are on, by sensor, if others are off.
@@ -191,7 +187,6 @@ class Participants:
         self.listed = self._able(settings, problem)
         self.ways = {case.label: self._way(case, problem) for case in self.listed}
         self.each_way = list(dict.fromkeys(self.way(case, one) for one in Reference for case in self.listed))
-        self.unguided: dict[str, str] = {}
         self.integrators: dict[str, StepIntegrator] = {}
         #: The experiment and the options that determine an integrator, by its label.
         self._origins: dict[str, tuple[Config, dict[str, Any]]] = {}
@@ -220,7 +215,11 @@ class Participants:
                 self._check(case, self._configs[case.label], problem)
             except ConfigError as error:
                 refused[case.label] = error
-            if self._moved and "paths" in case.options and settings.named is None:  # the others have a run's paths
+            # The others have a run's paths. Camera paths are not guided.
+            repeats = "paths" in case.options or (
+                "guiding" in case.options and self._way(case, problem).paths == "camera"
+            )
+            if self._moved and repeats and settings.named is None:
                 refused.setdefault(case.label, ConfigError("--integrators", case.label, "repeats another estimator"))
         listed = [case for case in settings.integrators if case.label not in refused]
         if refused and (settings.named is not None or not listed):
@@ -275,9 +274,7 @@ class Participants:
         self._origins[label] = config or self._config, {"type": kind} | options
 
     def _add_listed(self, case: NamedIntegrator) -> None:
-        """Add the integrator of a case, and variants with the options that references need: unguided and guided steps,
-        and other attached derivatives.
-        """
+        """Add the integrator of a case, and variants with the attached derivatives that references need."""
         label, config = case.label, self._configs[case.label]
         kind, options = config.integrator.type, config.integrator.options()
         if kind == "custom":
@@ -285,7 +282,6 @@ class Participants:
             own.ready()  # before anything is rendered
             self.integrators[label], self._origins[label] = own, (config, {"type": kind} | options)
             return
-        guiding, asked = options["guiding"], self._config.integrator.options().get("guiding", "off")
         if self._moved and kind == "reslrb":
             options |= {"paths": "light", "light_share": PLAIN["light_share"]} | self.ways[label].options
         if kind == "reslrb":  # as in a run
@@ -293,10 +289,6 @@ class Participants:
             if (place := getattr(config.integrator, "file", None)) is not None:
                 load_estimator(place, "--integrators", label)
         self._add(label, kind, config, **options)
-        if case.options.get("guiding", asked) != "off" and self.ways[label].paths != "camera" and not self.lit:
-            self.unguided[label] = label if guiding == "off" else f"{label}, unguided"
-            self._add(_alike(label, Reference.UNGUIDED), kind, config, **options | {"guiding": "on"})
-            self._add(self.unguided[label], kind, config, **options | {"guiding": "off"})
         edgeless = (self._config.integrator.options() | case.options).get("edges") == "off"
         for reference in Reference if self.attached else ():
             alike = ALIKE.get(reference, {}) | ({"edges": "off"} if edgeless else {})
@@ -336,8 +328,7 @@ class Participants:
             return [Reference.FINITE_DIFFERENCE]
         stock, _ = self.stock[self.way(listed, Reference.PTRACER).named(key)]
         found = [Reference.WALK_AD] + ([] if stock is None else [stock])
-        found += [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
-        return found + ([Reference.UNGUIDED] if listed.label in self.unguided else [])
+        return found + [Reference.FINITE_DIFFERENCE] + ([Reference.FORWARD_MODE] if self.forward_mode else [])
 
     def _are_unlike(self, references: Iterable[tuple[Reference | None, str]]) -> bool:
         """Whether some references lose light along the film's border and others do not."""
@@ -404,9 +395,9 @@ class Participants:
         Tangents are forward derivatives. All estimators of the same paths have equal tangents.
         """
         tracer = self.integrators[self._tracer(kind, of)]
-        if kind == "gradient":
-            self._teach(of)
-            return self.gradient(tracer, seed)
+        if kind == "gradient":  # a step as in the experiment
+            options = {"step": self.case.known_step} if self.known else {}
+            return self.case.gradient(tracer, seed, self.spp, **options)
         if kind == "image":
             image = self.case.image(tracer, seed, self.spp)
             return (image * interior(image.shape, self.sensor)[:, :, None] if self.masked else image).ravel()
@@ -414,25 +405,6 @@ class Participants:
             return np.array([along.difference(self.case, tracer, seed, self.spp) for along in self.directions[of]])
         return np.array([self.case.tangent(tracer, d.vector, seed, self.spp) for d in self.directions[of]])
 
-    def gradient(self, integrator: StepIntegrator, seed: int) -> np.ndarray:
-        """Take a step as in the experiment, and return the gradient of all parameters as a flat array."""
-        options = {"step": self.case.known_step} if self.known else {}
-        return self.case.gradient(integrator, seed, self.spp, **options)
-
-    def _teach(self, of: str) -> None:
-        """Train the tables of the guided steps `of` once, then keep the tables. Each sample then depends only on its
-        seed. Other integrators learn nothing.
-        """
-        if of not in (_alike(label, Reference.UNGUIDED) for label in self.unguided):
-            return
-        tracer = self.integrators[of]
-        assert isinstance(tracer, LightTracer)
-        guiding = tracer.preparation.guiding
-        if guiding is not None and not guiding.held:
-            for lesson in seeds(LESSONS, 8):
-                self.gradient(tracer, lesson)
-            guiding.held = True
-
 
 def _alike(label: str, reference: Reference) -> str:
-    return f"{label}, guided" if reference is Reference.UNGUIDED else f"{label}, as {reference.value}"
+    return f"{label}, as {reference.value}"

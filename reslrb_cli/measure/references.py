@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import mitsuba as mi
@@ -29,7 +30,6 @@ from reslrb_cli.scene.upsampling import values_of
 
 #: References that trace paths from the sensor.
 CAMERA_PATHS = (Reference.PRB, Reference.PATH)
-
 
 #: Longest paths without roulette; naive AD of stock integrators keeps all segments.
 DEEPEST = 64
@@ -60,13 +60,12 @@ class Situation:
     lit: tuple[int, ...] | None = None
 
     @classmethod
-    def of(
-        cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, attached: bool = False,
-        moved: tuple[str, ...] = (), paths: str = "light", lit: tuple[int, ...] | None = None,
-    ) -> Situation:  # fmt: skip
-        """Return the `Situation` of a loaded scene. `params` is the result of `mi.traverse` for the scene."""
-        graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor, lit), look(scene, sensor)
-        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, attached, moved, paths, lit)
+    def of(cls, scene: Any, sensor: Any, params: Any, max_depth: int, hide_emitters: bool, **others: Any) -> Situation:
+        """Return the `Situation` of a loaded scene. `params` is the result of `mi.traverse` for the scene, and `others`
+        are further fields.
+        """
+        graph, needs, view = SceneGraph.of(scene), scene_needs(scene, sensor, others.get("lit")), look(scene, sensor)
+        return cls(scene, params, graph, needs, view, max_depth, hide_emitters, **others)
 
     @classmethod
     def of_problem(cls, problem: Problem, sensor: int) -> Situation:
@@ -78,12 +77,18 @@ class Situation:
         # Stock integrators in the problem itself are compared like light paths.
         paths = problem.paths if problem.config.integrator.type == "reslrb" else "light"
         lit = lit_emitters(problem.config, problem.scene).get(sensor)
-        return cls.of(problem.scene, seen, params, depth, hidden, attached, moved, paths, lit)
+        others = {"attached": attached, "moved": moved, "paths": paths, "lit": lit}
+        return cls.of(problem.scene, seen, params, depth, hidden, **others)
 
     @property
     def has_pointlike(self) -> bool:
         """Whether any light comes from a point or from a single direction."""
         return any(int(emitter.flags()) & int(mi.EmitterFlags.Delta) for emitter in self.scene.emitters())
+
+    @cached_property
+    def has_mirrored(self) -> bool:
+        """Whether a mesh is mirrored (`_is_mirrored`)."""
+        return any(map(_is_mirrored, self.scene.shapes()))
 
 
 def choose(reasons: Mapping[Reference, str | None]) -> tuple[Reference | None, str]:
@@ -111,38 +116,36 @@ def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
     return {name: reasons[name](at, key) for name in of_image(at)}
 
 
+#: A condition, and the reason against a reference if it is true.
+Check = tuple[Any, str]
+
+
+def _first(*checks: Check) -> str | None:
+    """Return the reason of the first check whose condition is true, or None."""
+    return next((reason for holds, reason in checks if holds), None)
+
+
 def ptracer_image(at: Situation) -> str | None:
     """Return the reason against stock light tracing (`ptracer`) without roulette as reference for the image, or
     None.
     """
-    if any(_is_turned(emitter) for emitter in at.scene.emitters()):
-        return "it has wrong emission from a rotated environment map"
-    if (wrong := _wrong_everywhere(at)) is not None:
-        return wrong
-    if any(sensor.film().class_name() == "SpecFilm" for sensor in at.scene.sensors()):
-        return "it does not splat on a specfilm"
-    if at.needs.has_null:
-        return "it does not connect through masks"
-    if any(_is_mirrored(shape) for shape in at.scene.shapes()):
-        return "it renders mirrored meshes black"
-    if at.needs.has_perturbed_normals:
-        return "it treats bump and normal maps differently"
-    clipping = stock_clip(at.needs)
-    if clipping is not None:
-        return f"it {clipping}"
-    if not ends(at.max_depth):
-        return f"without roulette its paths must end at depth {DEEPEST} or before"
-    if at.paths == "light":
-        return None
-    if at.view.specular > 0:
-        return "it does not connect to glass or mirrors, which the sensor sees"
-    if at.hide_emitters and at.view.emission > 0:
-        return "hidden emitters stop its paths, but not paths from the sensor"
-    if at.paths == "camera" and at.has_pointlike and at.needs.has_delta_lobes:
-        return (
-            "it finds light that paths from the sensor cannot find: point or parallel lights through glass or mirrors"
-        )
-    return None
+    seen, clipping = at.paths != "light", stock_clip(at.needs)
+    return _first(
+        (any(map(_is_turned, at.scene.emitters())), "it has wrong emission from a rotated environment map"),
+        *_wrong_everywhere(at),
+        (any(sensor.film().class_name() == "SpecFilm" for sensor in at.scene.sensors()),
+         "it does not splat on a specfilm"),
+        (at.needs.has_null, "it does not connect through masks"),
+        (at.has_mirrored, "it renders mirrored meshes black"),
+        (at.needs.has_perturbed_normals, "it treats bump and normal maps differently"),
+        (clipping, f"it {clipping}"),
+        (not ends(at.max_depth), f"without roulette its paths must end at depth {DEEPEST} or before"),
+        (seen and at.view.specular > 0, "it does not connect to glass or mirrors, which the sensor sees"),
+        (seen and at.hide_emitters and at.view.emission > 0,
+         "hidden emitters stop its paths, but not paths from the sensor"),
+        (at.paths == "camera" and at.has_pointlike and at.needs.has_delta_lobes,
+         "it finds light that paths from the sensor cannot find: point or parallel lights through glass or mirrors"),
+    )  # fmt: skip
 
 
 def ends(max_depth: int) -> bool:
@@ -152,55 +155,48 @@ def ends(max_depth: int) -> bool:
 
 def path_image(at: Situation) -> str | None:
     """Return the reason against the integrator `path` as reference for the image, or None."""
-    if at.needs.has_null and (at.needs.environment is None or at.hide_emitters):
-        return "it loses light reflected by masks if nothing is behind them"
-    return prb_image(at)
+    lost = at.needs.has_null and (at.needs.environment is None or at.hide_emitters)
+    return _first((lost, "it loses light reflected by masks if nothing is behind them")) or prb_image(at)
 
 
-def _wrong_everywhere(at: Situation) -> str | None:
-    """Return what all stock integrators render wrongly in the scene, as a reason, or None."""
-    if at.lit is not None:
-        return "it cannot switch lamps off"
-    if at.needs.blends:
-        return "it renders blends of singular and smooth lobes wrongly"
-    if any(lamp.shared for lamp in at.needs.lamps):
-        return "it samples only one of the points of a textured lamp that have the same texture coordinates"
-    return None
+def _wrong_everywhere(at: Situation) -> tuple[Check, ...]:
+    """Return checks of what all stock integrators render wrongly."""
+    return (
+        (at.lit is not None, "it cannot switch lamps off"),
+        (at.needs.blends, "it renders blends of singular and smooth lobes wrongly"),
+        (any(lamp.shared for lamp in at.needs.lamps),
+         "it samples only one of the points of a textured lamp that have the same texture coordinates"),
+    )  # fmt: skip
 
 
 def camera_fault(at: Situation) -> str | None:
     """Return a part of the scene that `path` and `prb` render wrongly, as a reason, or None."""
-    if at.hide_emitters and at.view.emission > 0 and any(not shape.is_mesh() for shape in at.graph.shapes()):
-        return "it takes spheres, disks and cylinders behind hidden emitters for nearer than they are"
-    return _wrong_everywhere(at)
+    behind = at.hide_emitters and at.view.emission > 0 and any(not shape.is_mesh() for shape in at.graph.shapes())
+    nearer = "it takes spheres, disks and cylinders behind hidden emitters for nearer than they are"
+    return _first((behind, nearer), *_wrong_everywhere(at))
 
 
 def prb_image(at: Situation) -> str | None:
     """Return the reason against the integrator `prb` as reference for the image, or None."""
-    if (wrong := camera_fault(at)) is not None:
-        return wrong
-    if any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()):
-        return "camera paths cannot find a `directionalarea` emitter"
-    if at.has_pointlike and at.needs.has_null:
-        return "it cannot find point or parallel lights through masks"
-    # Light that glass and mirrors hide from it is hidden from other paths from the sensor, too.
-    if at.has_pointlike and at.needs.has_delta_lobes and at.paths != "camera":
-        return "camera paths cannot find point or parallel lights through glass or mirrors"
-    if at.paths != "light":
-        return None
-    if at.view.specular > 0:
-        return "the sensor sees glass or mirrors, to which light paths cannot connect"
-    if at.hide_emitters and at.view.emission > 0:
-        return "it sees through hidden emitters, which stop light paths"
-    return None
+    light, pointlike = at.paths == "light", at.has_pointlike
+    return camera_fault(at) or _first(
+        (any(emitter.class_name() == "DirectionalArea" for emitter in at.scene.emitters()),
+         "camera paths cannot find a `directionalarea` emitter"),
+        (pointlike and at.needs.has_null, "it cannot find point or parallel lights through masks"),
+        # Light that glass and mirrors hide from it is hidden from other paths from the sensor, too.
+        (pointlike and at.needs.has_delta_lobes and at.paths != "camera",
+         "camera paths cannot find point or parallel lights through glass or mirrors"),
+        (light and at.view.specular > 0, "the sensor sees glass or mirrors, to which light paths cannot connect"),
+        (light and at.hide_emitters and at.view.emission > 0,
+         "it sees through hidden emitters, which stop light paths"),
+    )  # fmt: skip
 
 
 def ptracer_gradient(at: Situation, key: str) -> str | None:
     """Return the reason against stock light tracing (`ptracer`) with naive AD as reference for the gradient with
     respect to `key`, or None.
     """
-    reason = ptracer_image(at)
-    if reason is not None:
+    if (reason := ptracer_image(at)) is not None:
         return reason
     if moves_light(at.params, key):
         return _ptracer_motion(at, (key,) if key in at.params.properties else at.moved)
@@ -221,17 +217,15 @@ def _ptracer_motion(at: Situation, keys: tuple[str, ...]) -> str | None:
     """Return the reason against stock light tracing (`ptracer`) as reference for the gradient with respect to
     parameters that move light, or None.
     """
-    for key in keys:
-        if bends_light(at.params, key):
-            return "it draws wavelengths by itself, and keeps one in four behind each refraction"
-        node = at.params.properties[key][2]
-        if not isinstance(node, mi.Shape) or node.is_emitter():
-            return "it does not differentiate the sampling of a moving emitter"
-    if at.needs.unfollowed:
-        return (
-            f"it differentiates the sampling of a {at.needs.unfollowed[0].class_name()}, but not its choice of a lobe"
-        )
-    return None
+    nodes = [at.params.properties[key][2] for key in keys]
+    of = "it differentiates the sampling of a"
+    return _first(
+        (any(bends_light(at.params, key) for key in keys),
+         "it draws wavelengths by itself, and keeps one in four behind each refraction"),
+        (any(not isinstance(node, mi.Shape) or node.is_emitter() for node in nodes),
+         "it does not differentiate the sampling of a moving emitter"),
+        *((True, f"{of} {bsdf.class_name()}, but not its choice of a lobe") for bsdf in at.needs.unfollowed),
+    )  # fmt: skip
 
 
 def prb_gradient(at: Situation, key: str) -> str | None:
@@ -240,18 +234,15 @@ def prb_gradient(at: Situation, key: str) -> str | None:
     """
     if moves_light(at.params, key):
         return "it has no derivatives of moving light"
-    reason = prb_image(at)
-    if reason is not None:
-        return reason
-    if np.any(np.array(values_of(at.params, key)) == 0):
-        return "it loses derivatives if a channel is exactly 0"
-    if any(lamp.surrounds for lamp in at.needs.lamps):
-        return "it is some tenths of a percent off inside of an emitting sphere"
-    if parameter_kind(at.params, key) != "emitter" and any(
+    delta = parameter_kind(at.params, key) != "emitter" and any(
         int(bsdf.flags()) & int(mi.BSDFFlags.Delta) for bsdf in bsdfs_of(at, key)
-    ):
-        return "it does not differentiate delta lobes and masks"
-    return None
+    )
+    return prb_image(at) or _first(
+        (np.any(np.array(values_of(at.params, key)) == 0), "it loses derivatives if a channel is exactly 0"),
+        (any(lamp.surrounds for lamp in at.needs.lamps),
+         "it is some tenths of a percent off inside of an emitting sphere"),
+        (delta, "it does not differentiate delta lobes and masks"),
+    )  # fmt: skip
 
 
 def bsdfs_of(at: Situation, key: str) -> list[Any]:

@@ -209,8 +209,8 @@ class SummaryRecord(Line):
 class Reference(str, enum.Enum):
     """Reference for a gradient.
 
-    `forward_mode` uses the dot product <w, J v> = <J^T w, v>. `unguided` compares guided steps with unguided steps of
-    the same estimator.
+    `forward_mode` uses the dot product <w, J v> = <J^T w, v>. Earlier versions also
+    have `unguided`, unguided steps of the same estimator.
     """
 
     PTRACER = "ptracer"

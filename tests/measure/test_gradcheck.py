@@ -75,9 +75,9 @@ def box(*overrides: str) -> Config:
     return loads(small.CORNELL_BOX, small.CORNELL_BOX_SOURCE, [*SMALL, *overrides])
 
 
-def situation(made: Case, depth: int = 4, hidden: bool = False, *more: Any, **options: Any) -> Situation:
+def situation(made: Case, depth: int = 4, hidden: bool = False, **options: Any) -> Situation:
     """Return the situation of a case with its first sensor."""
-    return Situation.of(made.scene, made.scene.sensors()[0], made.params, depth, hidden, *more, **options)
+    return Situation.of(made.scene, made.scene.sensors()[0], made.params, depth, hidden, **options)
 
 
 def check(*overrides: str, estimators: str = "reservoir,event,gather,stack", seeds: int = 8) -> list[GradcheckRecord]:
@@ -123,19 +123,19 @@ def test_differently_sampled_paths_agree_with_naive_ad_in_expectation(drawn: str
     assert kinds == {Kind.EXPECTATION}
 
 
-@pytest.mark.parametrize("guiding", a_few(["on", "auto"], ["auto"]))
-def test_guided_steps_are_compared_with_unguided_ones(guiding: str, monkeypatch: pytest.MonkeyPatch):
-    """Runs with guiding, or with `auto`, are compared with unguided steps, which lack a fault of the tables."""
-    guided = (f"integrator.guiding={guiding}", *SMALLER)
-    made = Gradcheck(CheckSettings(box(*guided), estimators_of("stack"), 0, 8))
-    made.rows = [row for row in made.rows if row.reference is Reference.UNGUIDED]
-    [record] = made.run(lambda: False, lambda line: None)
-    assert (record.seeds, record.holds) == (8, True)
+def test_guided_steps_are_checked_if_a_run_may_guide(monkeypatch: pytest.MonkeyPatch):
+    """A fault of the tables shows in guided steps alone."""
+    config = box("integrator.guiding=auto", *SMALLER)
+    labels = [case.label for case in all_estimators(config)]
+    assert labels[-1] == "reslrb:stack(guiding=on)"
+    for changes in ("integrator.guiding=off", "integrator.guiding=on", "integrator.paths=camera"):
+        assert labels[-1] not in [case.label for case in all_estimators(box("integrator.guiding=auto", changes))]
+    assert failures(check(*SMALLER, estimators="stack(guiding=on)")) == set()
 
     without_weight(monkeypatch)
-    found = failures(check(*guided, estimators="stack"))
-    assert ("stack", "unguided") in found
-    assert guiding == "on" or found == {("stack", "unguided")}
+    found = failures(check(*SMALLER, estimators="stack,stack(guiding=on)"))
+    assert {name for name, _ in found} == {"stack(guiding=on)"}
+    assert {"walk_ad", "ptracer", "finite_difference"} <= {reference for _, reference in found}
 
 
 def stronger(right: Any) -> Any:
@@ -464,13 +464,14 @@ def test_differences_of_moving_shapes_have_the_paths_of_a_run(asked: str, paths:
     config = load(CONFIGS / "moved_box.yaml", [*SMALL_BOX, f"integrator.paths={asked}"])
     made = Gradcheck(CheckSettings(config, None, 0, 3))
     parts, labels = made.participants, ["reslrb:reservoir", "reslrb:stack"]
-    assert [case.label for case in parts.listed] == (labels if paths != "camera" else ["reslrb:stack"])
+    guided = [*labels, "reslrb:stack(guiding=on)"]
+    assert [case.label for case in parts.listed] == (guided if paths != "camera" else ["reslrb:stack"])
     found = {(row.reference, row.way.paths) for row in made.rows if row.key is not None}
-    assert found - {(Reference.UNGUIDED, paths)} == {
+    assert found == {
         (Reference.FINITE_DIFFERENCE, paths),
         *((reference, "light") for reference in (Reference.WALK_AD, Reference.PTRACER, Reference.FORWARD_MODE)),
     }
-    for reference, kind in {one: one_way for one, one_way in found if one is not Reference.UNGUIDED}.items():
+    for reference, kind in found:
         tracer = parts.integrators[parts.sampled("reslrb:stack", reference)]
         assert isinstance(tracer, LightTracer)
         assert tracer.paths == kind
@@ -668,7 +669,7 @@ def test_references_of_moving_scenes():
     case = Case(scene, [])
 
     def at(*moved: str) -> Situation:
-        return situation(case, 4, True, True, moved)
+        return situation(case, 4, True, attached=True, moved=moved)
 
     assert moves_light(case.params, "ball.to_world")
     assert moves_light(case.params, "lamp.translation")
