@@ -21,7 +21,7 @@ from reslrb_cli.config.loader import with_integrator
 from reslrb_cli.config.schema import Config
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.comparison import ALPHA, Family, compare_expectations, entry_count
-from reslrb_cli.measure.engine import STEPS, start_process
+from reslrb_cli.measure.engine import start_process
 from reslrb_cli.measure.judgement import jackknife
 from reslrb_cli.measure.methods import NEVER, first_message
 from reslrb_cli.measure.participants import ALIKE
@@ -120,7 +120,7 @@ class Sampling:
         self._say(f"{kind.label}: {count} seed{'s' if count > 1 else ''}")
         config, sampled = comparable(self.config, kind.by), {"quantity": "fixed", "arrays": self.arrays}
         first = first_message(config, VARIANT, self._limit, purpose=series, **sampled)
-        process, taken = start_process(first, f"{STEPS}:begin"), []
+        process, taken = start_process(first), []
         try:
             process.answer(lambda: False)
             for number in range(count):

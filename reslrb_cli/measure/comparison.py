@@ -1,34 +1,24 @@
 """Comparisons of Monte Carlo estimates of gradients and images with a reference.
 
-Welch's test of each entry compares two means over N and M independent samples.
-
-    t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M)
-
-t is converted to the standard normal z of the same probability, with the degrees of freedom of Welch and Satterthwaite.
-With this conversion, a small number of samples does not look like a bias.
-
-The gradient of a small parameter is compared entry by entry. The gradient of a large parameter is compared by tiles and
-projections. A texel that few paths reach has a gradient with noise far from normal. Thousands of texel z scores would
-raise false alarms. A large texture is therefore compared in tiles. Each tile is a sum over texels, per channel. Other
-large parameters are compared in runs of consecutive entries. Errors that cancel within a tile show up in projections on
-random signs. Each projection includes every texel, and the projection's noise is closer to normal. The last entry is
-the sum of all entries, in which small errors add up.
-
 Samples are (N, P): N seeds, P entries. Gradients are compared over many seeds by z scores (`compare_expectations`), or
-at equal seeds by relative L2, of all entries together and of each entry (`compare_equal_seeds`). With equal seeds on
-both sides, the test of expectations uses the differences a - b. The paired test is valid for any noise that both sides
-share. More shared noise makes the test more powerful. z is the normal deviate with the same probability as t.
+at equal seeds by relative L2, of all entries together and of each entry (`compare_equal_seeds`).
 
-    t_k = mean_k(a - b) / sqrt(var_k(a - b) / N + floor_k^2)
+Welch's test of each entry compares two means over N and M independent samples. With equal seeds on both sides, the test
+uses the differences a - b. It is then valid for any noise that both sides share, and shared noise makes it stronger.
 
-A deviation must be significant with and without the rounding error `floor`: z is the smaller of both scores. Few
-samples can have a variance that is too small by chance. Rounding must not then count as noise of a known size. A known
-error of the reference is no noise: it is subtracted from the deviation.
+    t = (mean_a - mean_b) / sqrt(s_a^2 / N + s_b^2 / M + floor^2)
 
-Two criteria must hold. First, the largest |z| must be below Sidak's threshold for all entries of all rows of a table.
-Second, the root mean square of z over a row's noisy entries must be below a limit for nu normal deviates. Entries
-without noise, such as unlit tiles, have z = 0 and would dilute the root mean square. nu is the effective number of
-independent noisy entries (Satterthwaite). r^2 is the mean squared correlation between the samples of different entries,
+z is the standard normal deviate with the same probability as t, so few samples do not look like a bias. A deviation
+must be significant with and without the rounding error `floor`, because few samples can have a variance that is too
+small by chance. A known error of the reference is no noise: it is subtracted from the deviation.
+
+A small parameter is compared entry by entry. A texel that few paths reach has noise far from normal, so a large texture
+is compared by sums over tiles, per channel, and other large parameters by runs of entries. Errors that cancel within a
+tile show up in projections of all entries on random signs. Small errors add up in the sum of all entries.
+
+Two criteria must hold. The largest |z| must be below Sidak's threshold for all entries of all rows of a table. The root
+mean square of z over a row's noisy entries must be below a limit for nu normal deviates. nu is the effective number of
+independent noisy entries (Satterthwaite), with the mean squared correlation r^2 between the samples of two entries,
 corrected for chance.
 
     nu = E / (1 + (E - 1) r^2)
@@ -37,7 +27,7 @@ If the tails of a row are too heavy for z scores, or unknown because there are f
 entries without noise are judged. The row fails if they deviate, and is open otherwise.
 
 `detectable` is the deviation that the first criterion finds with the probability `POWER`. t then has a noncentral t
-distribution. For few samples, the limit is many standard errors: 5.4 normal deviates are 23 with 8 samples.
+distribution.
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ class Session(Engine):
         self._survey_about = self._about(config, objective=objective, spp=plan.config.run.spp)
         stored = self.file.stored(self._survey_about)
         if stored is None:
-            process = self.launch(config, "begin_survey", objective=objective)
+            process = self.launch(config, quantity="survey", objective=objective)
             try:
                 stored = StoredResults(**self.hear(process))
             except Ended as end:

@@ -122,16 +122,11 @@ class Member:
             self.process = None
 
 
-#: Starts a process from its first message and the place of its function (`processes.run`).
-Start = Callable[[dict[str, Any], str], Any]
-
-#: The functions that processes run.
-STEPS = "reslrb_cli.measure.steps"
-
-
-def start_process(first: dict[str, Any], does: str) -> Process:
-    """Start a process that runs `processes.run` with `does`. `first` is its first message."""
-    return Process(first, python_command(f"from reslrb_cli.measure.processes import run\nrun({does!r})"))
+def start_process(first: dict[str, Any]) -> Process:
+    """Start a process that works for `steps.begin`. `first` is its first message."""
+    return Process(
+        first, python_command("from reslrb_cli.measure.processes import run\nrun('reslrb_cli.measure.steps')")
+    )
 
 
 class Engine:
@@ -143,8 +138,8 @@ class Engine:
 
     def __init__(
         self, plan: MeasurementPlan, stop: Callable[[], bool], say: Callable[[str], None], usual_rounds: int,
-        start: Start = start_process, now: Callable[[], float] = time.monotonic, spent_s: float = 0.0,
-        file: DrawsFile | None = None,
+        start: Callable[[dict[str, Any]], Any] = start_process, now: Callable[[], float] = time.monotonic,
+        spent_s: float = 0.0, file: DrawsFile | None = None,
     ) -> None:  # fmt: skip
         self.plan, self.file = plan, DrawsFile() if file is None else file
         self.members: list[Member] = []
@@ -181,12 +176,9 @@ class Engine:
         """The labels of the members without draws whose processes did not fail."""
         return [member.label for member in self.members if member.status is BenchStatus.OK and not member.kept]
 
-    def launch(self, config: Config, does: str, **more: Any) -> Any:
-        """Return a new process for `config` that runs the function `does` of `steps`. `more` are further entries of its
-        first message.
-        """
-        first = first_message(config, self.plan.variant, self.plan.memory_limit, **more)
-        return self._start(first, f"{STEPS}:{does}")
+    def launch(self, config: Config, **more: Any) -> Any:
+        """Return a new process for `config` (`steps.begin`). `more` are further entries of its first message."""
+        return self._start(first_message(config, self.plan.variant, self.plan.memory_limit, **more))
 
     def begin(self, members: Sequence[Member], arrays: Mapping[str, np.ndarray]) -> Iterator[Member]:
         """Start the processes of these members, load their scenes, and warm up until nothing is compiled. Yields each
@@ -194,7 +186,7 @@ class Engine:
         """
         for member in members:
             given = {"quantity": member.quantity, "purpose": member.purpose, "arrays": arrays}
-            member.process = self.launch(member.config, "begin", **given)
+            member.process = self.launch(member.config, **given)
         for member in members:
             self.sizes |= self._answer(member) or {}
         for member in members:

@@ -85,8 +85,6 @@ class Gradcheck:
         self.participants, self.file = Participants(settings), file or DrawsFile()
         self.draws: dict[Name, list[np.ndarray]] = {}
         self._about: dict[Name, dict[str, Any]] = {}
-        #: Rounding errors after each sample, so that fewer seeds than on file have the same results as without a file.
-        self._roundings: dict[Name, list[dict[str, float]]] = {}
 
     @cached_property
     def rows(self) -> list[Row]:
@@ -168,31 +166,27 @@ class Gradcheck:
                 say(f"{number + 1} of {self.seeds} seeds, {self._now() - self._begin:.0f} s")
 
     def _recall(self, name: Name) -> list[np.ndarray]:
-        """Return the samples on file, and restore their finite-difference steps and rounding errors."""
+        """Return the samples on file, and restore their finite-difference steps."""
         if self.file.path is None:
             return []
         self._about[name] = about = self.participants.about(*name)
         found, stored = self.file.draws(about), self.file.stored(about)
-        if found is None or stored is None or found.seeds.tolist() != list(seeds(len(found))):
+        if found is None or found.seeds.tolist() != list(seeds(len(found))):
             return []
-        roundings = list(stored.facts.get("roundings", ()))
-        if len(roundings) != len(found):  # the file is of an earlier version
-            return []
-        self._roundings[name] = roundings
-        rows = list(found.values)[: self.seeds]
-        self.participants.restore(name[1], stored.facts["steps"], roundings[len(rows) - 1])
-        return rows
+        if stored is not None:
+            self.participants.restore(name[1], stored.facts["steps"])
+        return list(found.values)[: self.seeds]
 
     def _take(self, name: Name, seed: int) -> None:
-        """Take a sample, and add it to the file with the facts that belong to it."""
+        """Take a sample, and add it to the file, with the finite-difference steps if it has any."""
+        about = self._about.get(name)
         if name[0] == "differences" and not self.draws[name]:
             self.participants.choose_steps(name[1])
+            if about is not None:
+                self.file.store(about, StoredResults({"steps": self.participants.steps(name[1])}, {}))
         self.draws[name].append(self.participants.sample(*name, seed).astype(np.float32))
-        if (about := self._about.get(name)) is not None:
+        if about is not None:
             self.file.add(about, Draws.of(about["purpose"], self.draws[name][-1], [seed]))
-            self._roundings.setdefault(name, []).append(dict(self.participants.case.roundings))
-            facts = {"steps": self.participants.steps(name[1]), "roundings": self._roundings[name]}
-            self.file.store(about, StoredResults(facts, {}))
 
     def records(self, interrupted: bool = False) -> list[GradcheckRecord]:
         """Return the comparisons of the samples so far, in the order of `rows`, and the parameters without a stock
@@ -250,13 +244,16 @@ class Gradcheck:
 
     def _figures(self, row: Row, count: int, family: Family) -> Comparison:
         parts = self.participants
-        ours, reference = (np.stack(self.draws[name][:count]).astype(np.float64) for name in self._needs(row))
+        sides = {name: np.stack(self.draws[name][:count]).astype(np.float64) for name in self._needs(row)}
+        ours, reference = (sides[name] for name in self._needs(row))
         shape, bias, rounding = None, np.zeros(1), ROUNDING
         if row.key is None:
             shape = tuple(parts.case.weights.shape)
         else:
             place, chosen = parts.case.places[row.key], parts.directions[row.place]
-            ours, rounding = ours[:, place], parts.case.rounding(row.key)
+            at = parts.case.size + parts.case.keys.index(row.key)  # its rounding error
+            rounding = max(float(rows[:, at].max()) for name, rows in sides.items() if name[0] == "gradient")
+            ours = ours[:, place]
             if row.reference in ALONG_DIRECTIONS:
                 ours = ours @ np.array([direction.vector[place] for direction in chosen]).T
             else:

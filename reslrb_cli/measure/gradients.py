@@ -3,17 +3,15 @@
 `Case` is a scene with its parameters and the objective sum(image * weights). The weights are fixed, so dL/dI is the
 same for every estimator. A gradient is one flat vector over all parameters of a case.
 
-Finite differences use common random numbers, along a few directions of one parameter (`Direction`). `choose_step`
-chooses the step h. The error of central differences, and of one-sided differences with three nodes, is c h^2 + ... Two
-steps therefore give the truncation error of the smaller step (Richardson 1911).
+Finite differences use common random numbers, along a few directions of one parameter (`Direction`). `choose_step` takes
+the step h with the smallest sum of errors. The truncation error is c h^2 + ..., so two steps give that of the smaller
+one (Richardson 1911).
 
     D(h) - F' ~ (D(r h) - D(h)) / (r^2 - 1)
 
-Paths that change discontinuously cause noise that grows as h shrinks. The noise appears as variation of D(r h) - D(h)
-between seeds. If light moves, rounding errors of the scene can be equal for all seeds. If a change does not shrink with
-h, the change is not truncation, and counts in full. Rounding errors of the scene, and waves of a BSDF's tables, are
-equal for all seeds. They grow at most as 1 / h, so a change by a shorter step bounds them for the longer step. The step
-with the smallest sum of errors is chosen. Its error that is equal for all seeds is stored.
+A change that does not shrink with h is no truncation, and counts in full. Rounding errors of the scene, and waves of a
+BSDF's tables, are equal for all seeds. They grow at most as 1 / h, so a change by a shorter step bounds them. Paths
+that change discontinuously cause noise that grows as h shrinks, and varies between seeds.
 """
 
 from __future__ import annotations

@@ -1,24 +1,21 @@
 """Terms that attached gradients lack: silhouettes, shadow edges, and light that leaves the film.
 
-`integrator.edges` adds silhouettes and shadow edges (`estimators/edges.py`). Some terms are still missing. Images at
-common random numbers contain all of these terms. `Tracing` compares images and gradients along K segments. A segment
-k is the part a <= s <= b of the line x + s d_k through the initial values x. w_k is dL/dI at the end of the segment
-with the higher loss.
+`integrator.edges` adds silhouettes and shadow edges (`estimators/edges.py`). Images at common random numbers have all
+terms. `Tracing` compares images and gradients along K segments a <= s <= b of the lines x + s d_k through the initial
+values x. w_k is dL/dI at the end of the segment with the higher loss.
 
     F_k = <w_k, I(b) - I(a)> / (b - a),   g_k = d_k . gradient of <w_k, I> at a random s,   m_k = F_k - g_k
     share = sqrt(sum_k E[m_k]^2 / sum_k E[F_k]^2)
 
-F_k is the mean derivative along the segment, whatever its length, and g_k is an unbiased sample of it if nothing is
-missing. Finite differences have no truncation error that could look like a missing part. dL/dI belongs to a displaced
-start. At the initial values themselves, the derivative of the loss may vanish: then any small error would be a large
-share. Along a segment, the image changes by about 3 % (`AIM`), or less if the segment would be longer than `LONGEST`.
+g_k is an unbiased sample of the mean derivative F_k if nothing is missing, whatever the segment's length, so no
+truncation error looks like a missing part. At the initial values themselves, the derivative of the loss may vanish.
+Along a segment, the image changes by about 3 % (`AIM`), or less if the segment would be longer than `LONGEST`.
 
-A significant share differs from 0 by Student's t (`MissingRecord.margin`). A run looks at its samples up to `LOOKS`
-times. The limit accounts for all looks and directions. A complete derivative of a parameter counts as incomplete with a
-probability of at most `ALARM`.
+A significant share differs from 0 by Student's t (`MissingRecord.margin`), with a limit for all directions and for all
+`LOOKS` at the samples. A complete derivative counts as incomplete with a probability of at most `ALARM`.
 
-The command `gradcheck --missing` and runs share `MissingCheck`. `check_missing` measures the missing share before a
-run's first iteration, and decides `edges: auto`.
+`gradcheck --missing` and runs share `MissingCheck`. `check_missing` measures before a run's first iteration, and
+decides `edges: auto`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -372,32 +372,36 @@ class Participants:
         digest = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()
         own = {"integrator": options, "spp": self.spp, "known": self.known, "masked": self.masked, "arrays": digest}
         own |= {"lit": self.lit} if self.lit else {}
-        return situation(config, mi.variant(), purpose=f"gradcheck, {kind} {of}", **own)
+        return situation(config, mi.variant(), purpose=f"gradcheck, {kind} of {of}", **own)
 
     def steps(self, of: str) -> list[tuple[float, float]]:
         """Return the finite-difference steps of a parameter, with their truncation errors."""
         return [(direction.step, direction.truncation) for direction in self.directions.get(of, ())]
 
-    def restore(self, of: str, steps: Sequence[tuple[float, float]], roundings: Mapping[str, float]) -> None:
-        """Set the steps and rounding errors that earlier samples have determined."""
-        for number, (step, truncation) in enumerate(steps):
-            self.directions[of][number] = replace(self.directions[of][number], step=step, truncation=truncation)
-        for key, value in roundings.items():
-            self.case.roundings[key] = max(self.case.rounding(key), value)
+    def restore(self, of: str, steps: Sequence[tuple[float, float]]) -> None:
+        """Set the steps that earlier samples have determined."""
+        self.directions[of] = [
+            replace(direction, step=step, truncation=truncation)
+            for direction, (step, truncation) in zip(self.directions[of], steps, strict=True)
+        ]
 
     def sample(self, kind: str, of: str, seed: int) -> np.ndarray:
         """Return one sample as a flat array. `kind` is `gradient`, `image`, `differences` or `tangents`.
 
-        A `gradient` sample covers all parameters. The sample comes from one gradient step, as in the experiment. Images
-        are black along the film's border if some, but not all, image references or estimators lose light there. `of` is
-        the label of an integrator. For `differences` and `tangents`, the sample has the derivatives along a parameter's
-        directions. For `differences` and `tangents`, `of` names the parameter and the kinds of paths (`Way.named`).
-        Tangents are forward derivatives. All estimators of the same paths have equal tangents.
+        `of` is the label of an integrator. A `gradient` comes from one step, as in the experiment. It covers all
+        parameters, followed by the relative rounding error of each. An `image` is black along the film's border if
+        some, but not all, image references or estimators lose light there.
+
+        For `differences` and `tangents` (forward derivatives), `of` names a parameter and the kinds of paths
+        (`Way.named`), and the sample has the derivatives along the parameter's directions. All estimators of the same
+        paths have equal tangents.
         """
         tracer = self.integrators[self._tracer(kind, of)]
         if kind == "gradient":  # a step as in the experiment
             options = {"step": self.case.known_step} if self.known else {}
-            return self.case.gradient(tracer, seed, self.spp, **options)
+            self.case.roundings.clear()
+            gradient = self.case.gradient(tracer, seed, self.spp, **options)
+            return np.append(gradient, [self.case.rounding(key) for key in self.case.keys])
         if kind == "image":
             image = self.case.image(tracer, seed, self.spp)
             return (image * interior(image.shape, self.sensor)[:, :, None] if self.masked else image).ravel()

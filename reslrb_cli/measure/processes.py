@@ -195,14 +195,13 @@ def last_words(text: str) -> str:
 Begun = tuple[dict[str, Any], Callable[[dict[str, Any]], dict[str, Any]]]
 
 
-def _serve(first: dict[str, Any], does: str, connection: Connection) -> None:
+def _serve(first: dict[str, Any], module: str, connection: Connection) -> None:
     os.environ["HOME"] = os.environ["DRJIT_CACHE_DIR"]  # a cold step must find no compiled kernels
     from reslrb_cli.backend.variant import set_variant
 
     set_variant(first["variant"])
 
-    module, _, name = does.partition(":")
-    begin = getattr(importlib.import_module(module), name)
+    begin = importlib.import_module(module).begin
     # Set late, because a library without memory looks like a missing one.
     _limit(first["memory_limit"])
     # All workers load the same scene, so their warnings are sent, and printed once.
@@ -245,18 +244,15 @@ def _failure(error: Exception, limited: bool) -> dict[str, Any]:
     }
 
 
-def run(does: str) -> None:
+def run(module: str) -> None:
     """Answer questions until the connection closes or a failure occurs, then end the process. The last answer describes
-    a failure.
-
-    `does` is the function that starts the case, as `MODULE:FUNCTION`. The function returns `Begun` for the first
-    message.
+    a failure. The function `begin` of the `module` starts the case, and returns `Begun` for the first message.
     """
     connection, limited, code = Connection(int(sys.argv[-1])), False, 0
     try:
         first = connection.recv()
         limited = first["memory_limit"] is not None
-        _serve(first, does, connection)
+        _serve(first, module, connection)
     except Exception as error:
         connection.send(_failure(error, limited))
         code = 1

@@ -1,11 +1,8 @@
 """Stock integrators as references: `ptracer`, `path` and `prb` for images, `ptracer` and `prb` for gradients.
 
-The functions `ptracer_image`, `path_image`, `prb_image`, `ptracer_gradient` and `prb_gradient` check one reference
-each. A function that checks a reference returns the reason against the reference, or None if the reference is valid.
-The section Baselines of docs/method.md explains the reasons.
-
-Light tracing loses light along the film's border, from samples just outside of the film. Images with camera paths lose
-no light there.
+Each function that checks a reference returns the reason against it, or None if it is valid. The section Baselines of
+docs/method.md explains the reasons. Light tracing loses light along the film's border, from samples just outside of the
+film. Images with camera paths lose no light there.
 """
 
 from __future__ import annotations

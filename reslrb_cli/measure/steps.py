@@ -127,9 +127,13 @@ class Sampler:
 
 
 def begin(first: dict[str, Any]) -> Begun:
-    """Start the process of a `Member`. The process first reports the size of film and textures. Each question then
-    asks for steps (`Sampler.answer`).
+    """Start a case. A process of a `Member` first reports the size of film and textures. Each question then asks for
+    steps (`Sampler.answer`). With the quantity `survey`, the process reports the facts and the arrays of `survey`, and
+    answers no questions.
     """
+    if first["quantity"] == "survey":
+        facts, arrays = survey(assemble_scene(told(first).with_exposures_fixed()), first["objective"])
+        return {"facts": facts, "arrays": arrays}, dict
     sampler = Sampler(told(first), first["quantity"], first["arrays"])
     return sampler.size, lambda question: sampler.answer(question, first["purpose"])
 
@@ -168,12 +172,6 @@ PATHS = {"fixed": 2**21, "loss": 2**23}
 
 #: Purpose of the samples of these images.
 _PURPOSE = "convergence, dL/dI"
-
-
-def begin_survey(first: dict[str, Any]) -> Begun:
-    """Start the process. The process first reports the facts and the arrays of `survey`. It answers no questions."""
-    facts, arrays = survey(assemble_scene(told(first).with_exposures_fixed()), first["objective"])
-    return {"facts": facts, "arrays": arrays}, dict
 
 
 def survey(problem: Problem, objective: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

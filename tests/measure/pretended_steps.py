@@ -13,7 +13,6 @@ import numpy as np
 from reslrb_cli.config.loader import loads
 from reslrb_cli.measure.convergence import Session
 from reslrb_cli.measure.draws import DrawsFile
-from reslrb_cli.measure.engine import STEPS
 from reslrb_cli.measure.judgement import ConvergenceResults, Judgement
 from reslrb_cli.measure.methods import MeasurementPlan, parse_cases
 from reslrb_cli.measure.processes import CannotStart, Ended, Stopped
@@ -30,8 +29,8 @@ class Pretended:
     refusing: set[str] = set()  # noqa: RUF012
     alive = 0
 
-    def __init__(self, first: dict[str, Any], does: str) -> None:
-        assert (does, first["quantity"]) == (f"{STEPS}:begin", "step")
+    def __init__(self, first: dict[str, Any]) -> None:
+        assert first["quantity"] == "step"
         config = loads(first["config"], "x.yaml")
         self.type, self.depth = config.integrator.type, config.integrator.max_depth
         self.asked, self.closed = 0, False
@@ -123,11 +122,11 @@ class Stage:
     def clock(self) -> float:
         return self.now
 
-    def start(self, first: dict[str, Any], does: str) -> Player:
+    def start(self, first: dict[str, Any]) -> Player:
         self.alive += 1
-        self.surveys += does.endswith(":begin_survey")
+        self.surveys += first["quantity"] == "survey"
         self.purposes += [first["purpose"]] if "purpose" in first else []
-        return Player(self, first, does)
+        return Player(self, first)
 
     def pretence(self, name: str) -> Pretence:
         """Return the method of a name such as `case reslrb:stack, 4 spp`. The key may lack the role and the sample
@@ -146,11 +145,11 @@ def _plain(name: str) -> str:
 class Player:
     """Replacement for a `Process`."""
 
-    def __init__(self, stage: Stage, first: dict[str, Any], does: str) -> None:
-        self.stage, self.first, self.does, self.closed, self.questions = stage, first, does, False, 0
+    def __init__(self, stage: Stage, first: dict[str, Any]) -> None:
+        self.stage, self.first, self.closed, self.questions = stage, first, False, 0
         self.question: dict[str, Any] | None = None
         self.name = first.get("purpose", "").removeprefix("convergence, ")
-        self.played = None if does.endswith(":begin_survey") else stage.pretence(self.name)
+        self.played = None if first["quantity"] == "survey" else stage.pretence(self.name)
 
     def ask(self, question: dict[str, Any]) -> None:
         self.question, self.questions = question, self.questions + 1

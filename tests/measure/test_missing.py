@@ -237,20 +237,6 @@ def beam(only: tuple[float, float, float], seeds: int = 2) -> Differenced:
 
 
 @pytest.mark.long
-def test_a_bending_slab():
-    found = beam((0, 1, 0), 4)
-    assert found.error < ERROR, found
-    assert found.standard_error < STANDARD_ERROR, found
-
-
-@pytest.mark.long
-def test_a_moving_receiver():
-    found = compare_with_differences(replace(SCENES["moved_receiver"], spp=16), count=3)
-    assert found.error < ERROR, found
-    assert found.standard_error < STANDARD_ERROR, found
-
-
-@pytest.mark.long
 def test_slopes_of_the_shading_correction_without_its_jumps(monkeypatch: pytest.MonkeyPatch):
     """Faces slide through the light. Within each face the shading correction has a slope, and at the face's edges the
     correction jumps back.
