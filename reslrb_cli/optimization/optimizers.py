@@ -43,7 +43,7 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
 #: Extent of a parameter with a transform, in units of u.
 EXTENT_OF_TRANSFORM = 2.0
 #: Largest number of entries of a parameter that `auto` moves together with others, and of texels of a heightmap.
-SMALL, SMALL_HEIGHTMAP = 4, 32
+SMALL, SMALL_HEIGHTMAP = 6, 32
 #: Longest step of these parameters and of motions as a share of the extent, and in the unit of a transform.
 LONGEST_OF_SMALL, LONGEST_OF_MOTION, LONGEST_OF_TRANSFORM = 0.25, 0.1, 0.3
 

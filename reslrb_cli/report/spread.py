@@ -95,6 +95,8 @@ def _candidates(results: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _spec(candidate: Mapping[str, Any]) -> str:
-    """Return the entry of `parameters` that recovers a candidate."""
+    """Return the entry of `parameters` that recovers a candidate, or the setting that recovers the response."""
+    if candidate["key"] == "response":
+        return "target.response: {curve: auto}"
     bounds = f", bounds: {candidate['bounds']}" if candidate.get("bounds") else ""
     return f"- {{key: {candidate['key']}{bounds}}}"

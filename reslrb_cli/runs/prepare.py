@@ -22,7 +22,7 @@ import numpy as np
 
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.integrators import ReslrbConfig
-from reslrb_cli.config.loader import dump
+from reslrb_cli.config.loader import changed, dump
 from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import flattened
@@ -36,7 +36,7 @@ from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.results import Images, Results
 from reslrb_cli.optimization.state import Settled, State, load, noted_of, on_file, put, standing
 from reslrb_cli.optimization.uncertainty.measuring import Certainty
-from reslrb_cli.optimization.views import own_channels, view_records
+from reslrb_cli.optimization.views import RESPONSE, own_channels, view_records
 from reslrb_cli.records.checkpoint import entries_below, save_checkpoint
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.manifest import Manifest, commit_of
@@ -363,7 +363,7 @@ def begin(
 
 def with_freed(config: Config, keys: Sequence[str], source: str) -> Config:
     """Return the experiment that also recovers the scene's parameters `keys`, within their usual bounds. They start at
-    the values of the scene. A variant must be set.
+    the values of the scene. `response` recovers the curve of the camera. A variant must be set.
 
     Raises a ConfigError, located by `source`, for a key that the scene does not have, that cannot be recovered, or that
     the experiment recovers already.
@@ -373,6 +373,9 @@ def with_freed(config: Config, keys: Sequence[str], source: str) -> Config:
     if wrong := [key for key in keys if not isinstance(key, str) or not key]:
         raise ConfigError(source, "", f"is {wrong[0]!r}; give a key that `reslrb inspect` lists")
     keys = list(dict.fromkeys(keys))
+    if RESPONSE in keys:
+        config = changed(config, [f"target.{RESPONSE}={{curve: auto}}"])
+        keys = [key for key in keys if key != RESPONSE]
     if not keys:
         return config
     scene = load_configured(config, keys=keys)

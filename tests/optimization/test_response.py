@@ -14,8 +14,13 @@ from kit import area, diffuse, ref, scene, sensor, shape
 from PIL import Image
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
+from reslrb_cli.optimization.uncertainty import candidates, fit
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
+from reslrb_cli.report.spread import misfit_lines
+from reslrb_cli.runs.prepare import with_freed
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -143,6 +148,13 @@ def test_derivatives_agree_with_differences(folder, response, adjoint):
     np.testing.assert_allclose(found, expected, rtol=0.05, atol=0.03 * np.abs(expected).max())
 
 
+def test_the_entries_of_a_response_are_judged_one_by_one(folder):
+    """They take part in the joint steps of `auto`."""
+    problem = make(folder, "target.response={curve: auto}")
+    assert problem.optimizer.is_small("response")
+    assert problem.optimizer.block.at["response"].stop - problem.optimizer.block.at["response"].start == 6
+
+
 def test_views_share_a_response_or_have_their_own(folder):
     views = "views=[{target: photo0.png}, {sensor: 1, target: photo1.png}]"
     sets = [views, "target={exposure: auto, response: {curve: auto}}"]
@@ -168,3 +180,36 @@ def test_views_share_a_response_or_have_their_own(folder):
         shared.optimizer.clear_gradient("response")
     np.testing.assert_allclose(parts[0], parts[1] + parts[2], rtol=1e-4)
     assert np.abs(parts[1] - parts[2]).max() > 0
+
+
+@pytest.mark.parametrize(("curve", "is_named"), [(filmed, True), (encoded, False)])
+def test_a_run_names_the_response_that_explains_the_misfit(tmp_path, curve, is_named, monkeypatch):
+    """The room has its true colours, except for a grey floor that is recovered."""
+    write_room(tmp_path, lambda light: curve(2 * light), spp=1024)
+    key = "floor.reflectance.value"
+    problem = make(tmp_path, "scene.file=true.xml", f"parameters=[{{key: {key}, bounds: [0, 1]}}]", "run.spp=64")
+    monkeypatch.setattr(candidates, "MOST_TESTED", 2)
+    curvature = LossCurvature(problem, 256, of_target=False)
+    curvature.along(plan_changes(problem, {key: 0.5, "exposure": 1.0}, 0.1), lambda: True)
+    problem.optimizer.set_value("exposure", mi.Float(2.0) + dr.opaque(mi.Float, 0))
+    problem.apply()
+    found = candidates.judge_fit(problem, fit.measure_fit(problem, curvature, lambda: True), curvature, lambda: True)
+    assert found.is_significant == is_named
+    assert [each.key for each in found.candidates[:1]] == ["response"] * is_named
+    if is_named:
+        first = found.candidates[0]
+        assert first.explained > 0.5
+        assert first.p < 1e-3
+        assert misfit_lines({"certainty": {"fit": found.to_json()}})[2].startswith(
+            "  target.response: {curve: auto}  # "
+        )
+
+
+def test_free_recovers_the_response(folder):
+    config = load(folder / "room.yaml")
+    freed = with_freed(config, ["response", "panel.bsdf.reflectance.value"], "--free")
+    assert freed.target.response.recovered == "curve"
+    assert freed.parameters[-1].keys == ["panel.bsdf.reflectance.value"]
+    fixed = load(folder / "room.yaml", ["target.exposure=1"])
+    with pytest.raises(ConfigError, match=r"response.curve: is recovered only up to a factor"):
+        with_freed(fixed, ["response"], "--free")

@@ -24,6 +24,11 @@ from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
 from reslrb_cli.optimization.uncertainty.fit import LEVEL, Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive, pseudo_inverse
+from reslrb_cli.optimization.uncertainty.response import (
+    may_have_response,
+    response_candidate,
+    response_derivatives,
+)
 from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
@@ -56,11 +61,13 @@ def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[
     if fit.p > LEVEL:
         return FitRecord(fit.p, 0.0, 0.0, False, [])
     try:
-        found = [] if known.biases else _find_candidates(problem, fit, known, go_on)
+        found = (
+            [] if known.biases else _find_candidates(problem, fit, known, go_on) + _test_response(problem, fit, known)
+        )
     except Exception as error:
         logger.warning(f"no parameters were tested that would reduce the misfit: {describe(error)}")
         found = []
-    named = [each for each in found if each[1] <= LEVEL_OF_NAMED]
+    named = sorted((each for each in found if each[1] <= LEVEL_OF_NAMED), key=lambda each: -each[0])
     energy = max(fit.energy, *(2 * fall for fall, *_ in named), 0.0)
     candidates = [replace(each, explained=min(2 * fall / max(energy, 1e-300), 1.0)) for fall, _, each in named]
     kept = [each for each in candidates if each.explained >= LEAST_EXPLAINED][:MOST_RECORDED]
@@ -131,6 +138,21 @@ def _test(
         own = [directions[each] for each in places]
         found.append((fall, p, _candidate(problem, proposals[key], own, offset, p)))
     return sorted(found, key=lambda each: (each[1] > LEVEL_OF_NAMED, -each[0]))
+
+
+def _test_response(problem: Problem, fit: Fit, known: LossCurvature) -> list[tuple[float, float, Candidate]]:
+    """Return the response of the camera as `_find_candidates` returns parameters, if a curve could be recovered."""
+    if not may_have_response(problem):
+        return []
+    derivatives = response_derivatives(problem, known)
+    places = np.flatnonzero(np.any(derivatives[0], axis=1))
+    new = derivatives[0][places], derivatives[1][places]
+    slope, variance = (known.thinned**n * known.in_a_row(each) for n, each in ((1, fit.slopes), (2, fit.variances)))
+    channels = np.full(len(places), max(each.shape[2] for each in fit.slopes))
+    fall, p, offsets = _Tests(known.derivatives, new, known.weights, slope, variance, channels).of(range(len(places)))
+    # As many tests as of other parameters, at most.
+    p = min(p * (1 + MOST_TESTED), 1.0)
+    return [(min(fall, 0.5 * fit.total), p, response_candidate(places, offsets, p))]
 
 
 def _unrecovered(problem: Problem) -> list[Proposal]:

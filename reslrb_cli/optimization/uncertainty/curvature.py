@@ -409,6 +409,11 @@ class LossCurvature:
         return {key: (a[key].astype(np.float64), b[key].astype(np.float64)) for key in a}
 
     @property
+    def images(self) -> list[list[Array]]:
+        """The images (H, W, C) of all views at the current values, by each set of samples."""
+        return self._base
+
+    @property
     def weights(self) -> Array:
         """The weights (N,) in the first set of `slopes`."""
         return self.in_a_row(self._weights) * self.thinned
