@@ -94,9 +94,8 @@ class OptimizeOptions(ExperimentOptions):
     "--free",
     multiple=True,
     metavar="KEY",
-    help="Recover this parameter of the scene too; `inspect` lists the keys. `response` recovers the curve of the camera. "
-    "If CONFIG is the folder of a run, the new "
-    "run starts from the values that it found. May be repeated.",
+    help="Recover this parameter of the scene too; `inspect` lists the keys. `response` is the curve of the camera. If "
+    "CONFIG is the folder of a run, the new run starts from the values that it found. May be repeated.",
 )
 @click.option(
     "--resume",

@@ -36,7 +36,7 @@ from reslrb_cli.optimization.response import RecoveredResponse
 from reslrb_cli.records.run_folder import exposed
 from reslrb_cli.scene.cameras import read_cameras, sensor_id
 from reslrb_cli.scene.parameters import Selection
-from reslrb_cli.scene.response import start
+from reslrb_cli.scene.response import LIMITS, start
 from reslrb_cli.scene.visibility import sees_specular
 
 Array = np.ndarray[Any, Any]
@@ -409,7 +409,7 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
             view.response.values = selection.factors
             if key not in selection.factors:
                 value = mi.Float(first.astype(np.float32)) + dr.opaque(mi.Float, 0)
-                selection.add_factor(key, value, Settings(initial=first.tolist(), transform="log"))
+                selection.add_factor(key, value, Settings(initial=first.tolist(), bounds=LIMITS, transform="log"))
         if not (key := view.exposure.key):
             continue
         view.exposure.values = selection.factors

@@ -26,6 +26,8 @@ SRGB, LINEAR = Response(encoding="srgb"), Response(encoding="linear")
 #: Linear value at which a curve equals sRGB. Value of a file, and linear value, below which a curve is proportional to
 #: sRGB.
 MIDDLE, DARKEST_VALUE, DARKEST = 0.18, 0.04045, 0.04045 / 12.92
+#: Bounds of recovered numbers. Noise would move numbers that hardly any pixel shows without limit.
+LIMITS = 0.1, 30.0
 #: Relative change of the light by one step of a file of integers. Values with larger steps count as clipped.
 COARSE = 0.05
 
