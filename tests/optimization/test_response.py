@@ -4,6 +4,7 @@ from pictures with film curves.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import drjit as dr
@@ -11,8 +12,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from kit import area, diffuse, ref, scene, sensor, shape
+from optimization.judged import iterate_to_the_end
 from PIL import Image
 
+import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble
@@ -213,3 +216,73 @@ def test_free_recovers_the_response(folder):
     fixed = load(folder / "room.yaml", ["target.exposure=1"])
     with pytest.raises(ConfigError, match=r"response.curve: is recovered only up to a factor"):
         with_freed(fixed, ["response"], "--free")
+
+
+def test_a_resumed_run_keeps_its_response(folder):
+    """In Python. The picture has a gamma of 1.8, and all colours are known. A copy stops half-way."""
+    write_room(folder, lambda light: np.clip(light, 0, 1) ** (1 / 1.8))
+    settings = {
+        "scene.file": str(folder / "true.xml"), "target.response": {"gamma": "auto"}, "run.spp": 64,
+        "run.iterations": 12, "run.final_spp": 16, "parameters": [{"key": "floor.reflectance.value", "bounds": [0, 1]}],
+    }  # fmt: skip
+    with rl.optimize(str(folder / "room.yaml"), folder=str(folder / "run"), overrides=settings) as run:
+        for record in run:
+            if record.iteration == 5:
+                break
+    half = float(run.parameters["response"])
+    assert half != pytest.approx(2.2)
+    with rl.optimize(resume=str(folder / "run")) as run:
+        assert float(run.parameters["response"]) == pytest.approx(half)
+        for _ in run:
+            pass
+        image, target = run.images[0], run.targets[0]
+    assert float(run.parameters["response"]) == pytest.approx(1.8, abs=0.1)
+    # The image is shown through the response.
+    assert np.median(np.abs(image[:, :, :3] / target - 1)) < 0.1
+    manifest = json.loads((folder / "run/manifest.json").read_text())
+    assert [view["response"] for view in manifest["views"]] == ["response"]
+
+
+def recover(folder: Path, *sets: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Run a recovery. Returns the values and their spreads, by parameter. Those of colours are errors."""
+    problem = make(folder, *sets)
+    certainty, last = iterate_to_the_end(problem)
+    found = certainty.measure(last.iteration + 1, last.elapsed_s, lambda: False)
+    spreads = {key: np.ravel(each.spread) for key, each in found.parameters.items()}
+    values = problem.values()
+    for name, true in ROOM.items():
+        values[f"{name}.reflectance.value"] -= true
+    return {key.removesuffix(".reflectance.value"): (value, spreads[key]) for key, value in values.items()}
+
+
+@pytest.mark.long
+def test_a_room_is_recovered_from_a_picture_with_a_film_curve(tmp_path):
+    """The film curve is not one of those that six numbers give. Without a response, colours are far off."""
+    write_room(tmp_path, lambda light: filmed(2 * light), size=24, spp=4096, suffix="jpg")
+    sets = "run.spp=256", "run.iterations=60"
+    found = recover(tmp_path, "target.response={curve: auto}", *sets)
+    assert max(np.abs(found[name][0]).max() for name in ROOM) < 0.05
+    assert found["response"][0][5] > 3
+    plain = recover(tmp_path, *sets)
+    assert np.mean([np.abs(plain[name][0]).max() > 0.1 for name in ROOM]) > 0.8
+
+
+@pytest.mark.long
+def test_a_room_with_the_usual_curve_needs_no_response_but_may_have_one(tmp_path):
+    """Contrasts that pixels show end at 1, within their spreads."""
+    write_room(tmp_path, lambda light: encoded(1.5 * light), size=24, spp=4096)
+    found = recover(tmp_path, "target.response={curve: auto}", "run.spp=256", "run.iterations=60")
+    assert max(np.abs(found[name][0]).max() for name in ROOM) < 0.06
+    value, spread = found["response"]
+    assert np.all(np.abs(value[1:4] - 1) < np.maximum(3 * spread[1:4], 0.05))
+
+
+@pytest.mark.long
+def test_two_views_share_a_curve(tmp_path):
+    """Their exposures differ by a known factor, which is found as well."""
+    exposures = iter((1.2, 2.4))
+    write_room(tmp_path, lambda light: filmed(next(exposures) * light), size=24, spp=4096)
+    views = "views=[{target: photo0.png, exposure: auto}, {sensor: 1, target: photo1.png, exposure: auto}]"
+    found = recover(tmp_path, views, "target={response: {curve: auto}}", "run.spp=128", "run.iterations=60")
+    assert max(np.abs(found[name][0]).max() for name in ROOM) < 0.05
+    assert found["exposure.1"][0] / found["exposure.0"][0] == pytest.approx(2, rel=0.03)
