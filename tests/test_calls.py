@@ -44,6 +44,7 @@ from reslrb_cli.scene import (
     cameras,
     catalog,
     deformation,
+    dispersion,
     edges,
     graph,
     needs,
@@ -190,6 +191,9 @@ tree.to_array(mi.Float(3)), tree.like(2.0, np.array(3)), tree.like(mi.Color3f(0)
 [left(*given) for given in ((None, False), ("finished", False), ("interrupted", False), ("failed", False), ("failed", True))]
 [planned._bounded(name)[-9:] for name in ("a" * 400, "ä" * 400, "a/b")], len(planned._bounded("a" * 400))
 [catalog._spectral_obstacle(node(kind), key) for kind, key in (("D65Spectrum", "a.d65.values"), ("IrregularSpectrum", "a.wavelengths"), ("IrregularSpectrum", "a.values"), ("BlackBodySpectrum", "a.temperature"), ("EnvironmentMapEmitter", "a.data"), ("EnvironmentMapEmitter", "a.scale"), ("Sphere", "a.vertex_color"))]
+[edges.has_edges(SimpleNamespace(is_mesh=lambda: mesh, class_name=lambda: kind)) for mesh, kind in ((True, "PLYMesh"), (False, "Cylinder"), (False, "Instance"), (False, "BSplineCurve"))]
+[needs.stock_clip(SimpleNamespace(lens_clip=lens, near_clip=near)) for lens in (True, False) for near in (True, False)]
+[[kind, key, dispersion.bends_light(SimpleNamespace(properties={"a.n_d": (0, 0, node(kind), 0), "a.alpha": (0, 0, node(kind), 0)}), key)] for kind in ("DispersiveDielectric", "SmoothDielectric") for key in ("a.n_d", "a.alpha", "a.gone")]
 [str(manifests.commit_of(Path(folder))) for folder in ("/", "/gone", "a" + chr(0))]
 jobs._PROGRESS.match("3/40: loss") is not None, jobs._PROGRESS.match("loss 3/4: x") is None
 """.strip().split("\n")  # noqa: E501

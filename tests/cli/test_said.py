@@ -20,6 +20,7 @@ from kit import work_in
 from measure.pretended_steps import CONFIG, Pretence, Pretended, Stage
 from report.measured import make_run
 
+from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.cli import gradcheck
 from reslrb_cli.measure import bench, convergence, extreme, methods, missing
 from reslrb_cli.measure import gradcheck as checks
@@ -256,19 +257,21 @@ def _work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def check(*words: str) -> None:
-    """Check the exit code, the output and the file of `--json` of a command. The first lines name the device. Options
-    of methods and missing values are left out of the file.
+    """Check the exit code, the output and the file of `--json` of a command. Options of methods and missing values are
+    left out of the file.
     """
     result = reslrb(*words, "--json", "a.jsonl")
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     warned = said.lines_of(result.stderr)
-    lines = Path("a.jsonl").read_text().splitlines()[1:] if Path("a.jsonl").exists() else []
+    lines = Path("a.jsonl").read_text().splitlines() if Path("a.jsonl").exists() else []
     records = [
         {key: value for key, value in json.loads(line).items() if key != "options" and value is not None}
         for line in lines
     ]
+    records[:1] = [said.masked(origin, Path.cwd()) for origin in records[:1]]
     written = [json.dumps(short(each)) for each in records]
-    said.check(" ".join(words), [result.exit_code, *result.stdout.splitlines()[1:], *warned, *written])
+    printed = [line.replace(device_name("llvm"), "DEVICE") for line in result.stdout.splitlines()]
+    said.check(" ".join(words), [result.exit_code, *printed, *warned, *written])
 
 
 def short(value: Any) -> Any:

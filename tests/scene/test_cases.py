@@ -309,9 +309,11 @@ def smaller_photographs(patch: Patch) -> Any:
         ("d.exr", floats),
     ):
         mi.Bitmap(pixels).write(name)
-    mi.Bitmap(floats, mi.Bitmap.PixelFormat.MultiChannel, ["x", "y", "z"]).write("e.exr")
+    layers = np.concatenate([floats, 2 * floats[:, :, :1]], 2)
+    for name, pixels, names in (("e.exr", floats, ["x", "y", "z"]), ("f.exr", layers, ["R", "G", "B", "depth"])):
+        mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names).write(name)
     found = []
-    for name in ("a.png", "b.png", "c.png", "d.exr", "e.exr"):
+    for name in ("a.png", "b.png", "c.png", "d.exr", "e.exr", "f.exr"):
         photo = images.read_stored(Path(name), upright=True)
         for raw in (False, True):
             path = Path(f"small-{raw}-{name}")

@@ -69,6 +69,7 @@ def scenes() -> dict[str, Any]:
         "orthographic": {"camera": camera("orthographic")},
         "thin lens": {"camera": camera("thinlens", aperture_radius=0.3, focus_distance=4.0)},
         "two lamps": {"more": {"type": "constant"}},
+        "area lamp": {"lamp": wall(WHITE, x=3, z=2, emitter=AREA)},
     }  # fmt: skip
 
 
@@ -86,6 +87,17 @@ def facts_of_scenes(patch: Patch) -> Any:
         kinds += [needs.camera_finds_all(scene, depth, gloss) for depth in (2, 3, -1) for gloss in (False, True)]
         found[name] = [about[0], lamps, obstacles, kinds, needs.blend_warning(at, needs.uneven_blends(at))]
     return found
+
+
+@case
+def paths_of_several_sensors(patch: Patch) -> Any:
+    """Each order of a sensor that any paths can render and one that camera paths cannot, still and with motions."""
+    meter = {"type": "irradiancemeter", "film": {"type": "hdrfilm"}}
+    scene = scene_of(wall=wall(WHITE, sensor=meter), mirror=wall(MIRROR, z=0.5, scale=0.3))
+    first, second = scene.sensors()
+    return [[needs.usual_paths(scene, views, depth, hidden, moves), needs.light_finds_all(scene, views, hidden)]
+            for views in ([first], [second], [first, second], [second, first])
+            for depth in (2, 5) for hidden in (False, True) for moves in (False, True)]  # fmt: skip
 
 
 @case

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -121,6 +121,14 @@ def numbers(value: Any) -> Any:
     return said.plain(np.array(getattr(value, "matrix", value) if "Transform" in type(value).__name__ else value))
 
 
+def give_tangents(values: Iterable[Any]) -> None:
+    """Propagate tangents of 0.5 in all entries of the values."""
+    for value in values:
+        dr.set_grad(value, 0.5)
+        dr.enqueue(dr.ADMode.Forward, value)
+    dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges)
+
+
 @pytest.mark.parametrize("id", IDS)
 def test_motions(id: str, solids: Any) -> None:
     free = {"sun": ["rotation"], "bulb": ["translation"], "spot": ["translation", "rotation"]}
@@ -144,6 +152,10 @@ def test_motions(id: str, solids: Any) -> None:
         dr.backward(dr.sum(dr.square(dr.ravel(leaf.matrix if hasattr(leaf, "matrix") else leaf))))
     selection.collect()
     found["gradients"] = {key: numbers(dr.grad(value)) for key, value in deformation.values.items()}
+    selection.hand_over(dict(deformation.values))
+    give_tangents(deformation.values.values())
+    selection.push()
+    found["tangents"] = {key: numbers(dr.grad(selection.params[key])) for key in selection.scene_keys}
     said.check(f"motion of {id}", found)
 
 
@@ -199,6 +211,59 @@ def test_glass_with_dispersion(rough: dict[str, Any]) -> None:
         parts = (value, density, weight, bs.wo, bs.pdf, bs.eta, mi.Float(bs.sampled_type))
         found[str(mode)] = [np.array(each, np.float64).round(5).tolist() for each in parts]
     said.check(f"glass with dispersion {rough}", found)
+
+
+@pytest.mark.usefixtures("spectral")
+def test_recovered_colours(make_scene: Callable[..., Any]) -> None:
+    """Colours and spectra of textures, surfaces and lamps in a spectral variant: before and after new values were set,
+    their gradients, tangents, and condition numbers.
+    """
+    pixels = np.random.default_rng(4).uniform(0.1, 0.9, (3, 2, 3)).astype(np.float32)
+
+    def image(raw: bool) -> dict[str, Any]:
+        return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": raw}
+
+    def wall(reflectance: Any, **more: Any) -> dict[str, Any]:
+        return {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": reflectance}, **more}
+
+    def rgb(*value: float) -> dict[str, Any]:
+        return {"type": "rgb", "value": list(value)}
+
+    scene = make_scene(
+        plain=wall(rgb(0.2, 0.5, 0.7)), image=wall(image(False)), raw=wall(image(True)),
+        grey=wall({"type": "uniform", "value": 0.3}), bulb={"type": "point", "intensity": rgb(3, 2, 1)},
+        lamp=wall(rgb(0, 1, 0), emitter={"type": "area", "radiance": rgb(0, 0, 4)}),
+        sky={"type": "envmap", "bitmap": mi.Bitmap(np.tile(pixels, (1, 2, 1)))},
+    )  # fmt: skip
+    params = mi.traverse(scene)
+    keys = [key for key in sorted(params.keys()) if key.endswith((".value", ".data", "scale"))]
+    found: dict[str, Any] = {}
+    for key in keys:
+        colours = upsampling.is_upsampled(params, key) and upsampling.colour_in_scene(params, key)
+        found[key] = [numbers(upsampling.values_of(params, key)), numbers(colours)]
+    free = [key for key in keys if upsampling.is_upsampled(params, key)]
+    selection = select_parameters(scene, [ParameterSpec(key=key) for key in free], "c.yaml")
+    colours = selection.colours
+    found["start"] = {key: numbers(selection.array(key)) for key in free}
+    selection.set_arrays({key: 0.5 * selection.array(key) for key in free})
+    found["colours"] = {key: numbers(selection.array(key)) for key in free}
+    found["keys"] = [colours.keys, [key in colours for key in keys]]
+    for key in free:
+        dr.enable_grad(colours[key])
+    selection.hand_over({key: colours[key] for key in free})
+    leaves = sorted({name for key in free for name in (key, upsampling.emitted(key)) if name in colours.properties})
+    found["placed"] = {key: numbers(params[key]) for key in leaves}
+    for key in leaves:
+        dr.set_grad(params[key], 0)
+        dr.backward(dr.sum(dr.square(dr.ravel(params[key]))))
+    found["cancellation"] = colours.cancellation()
+    selection.collect()
+    found["gradients"] = {key: numbers(dr.grad(colours[key])) for key in free}
+    selection.hand_over({key: colours[key] for key in free})
+    give_tangents(colours[key] for key in free)
+    selection.push()
+    found["tangents"] = {key: numbers(dr.grad(params[key])) for key in leaves}
+    said.check("recovered colours", found)
 
 
 @pytest.mark.usefixtures("spectral")

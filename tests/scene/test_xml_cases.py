@@ -12,9 +12,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from golden.cases import Cases, ending
-from scene.test_cases import ROOM, described, lines, made_room, picture
+from kit import with_wavelengths
+from scene.test_cases import FILM, ROOM, described, lines, made_room, picture
 
-from reslrb_cli.scene import catalog
+from reslrb_cli.integrators.plugin import register
+from reslrb_cli.scene import catalog, load
 from reslrb_cli.scene.export import Replacing
 from reslrb_cli.scene.xml import build, mend, read
 from reslrb_cli.scene.xml.read import read_description
@@ -239,6 +241,70 @@ def exported_values(patch: Patch) -> Any:
         fault, after = ending(replacing.put, info.key), lines(description.root)
         gone, new = ([line for line in a if line not in b] for a, b in ((before, after), (after, before)))
         found[info.key] = [fault, gone, new, [*replacing.writers]]
+    return found
+
+
+BY_WAVELENGTH = f"""<sensor type="perspective">{FILM}</sensor>
+<shape type="sphere" id="a"><bsdf type="conductor"><string name="material" value="Au"/></bsdf></shape>
+<shape type="sphere" id="b"><bsdf type="diffuse"><spectrum name="reflectance" value="400:0.3, 700:0.5"/></bsdf></shape>
+<shape type="sphere" id="c"><bsdf type="diffuse"><spectrum type="regular" name="reflectance">
+<string name="values" value="0.1 0.2 0.3"/><float name="wavelength_min" value="400"/>
+<float name="wavelength_max" value="700"/></spectrum></bsdf></shape>
+<shape type="sphere" id="d"><bsdf type="roughconductor"><spectrum name="eta" value="400:0.3, 700:0.5"/>
+<spectrum name="k" value="2"/></bsdf></shape>
+<emitter type="point" id="lamp"><spectrum name="intensity" value="400:3, 700:5"/></emitter>
+<emitter type="point" id="spot"><rgb name="intensity" value="1 2 3"/></emitter>"""
+
+
+@case
+def exported_spectra(patch: Patch) -> Any:
+    """Spectra by wavelength of surfaces, metals and lamps, in a spectral variant: as `exported_values`."""
+    variant = mi.variant()
+    mi.set_variant(with_wavelengths(variant))
+    try:
+        register()
+        described(BY_WAVELENGTH)
+        params = mi.traverse(load.load_scene(Path("scene.xml")))
+        found: list[Any] = []
+        for key in sorted(params.properties):
+            if key.endswith((".values", ".value")):
+                description = read_description(Path("scene.xml"), {})
+                before, replacing = lines(description.root), Replacing(description, params, "c.yaml")
+                fault = ending(replacing.put, key)
+                found.append([key, fault, [line for line in lines(description.root) if line not in before]])
+    finally:
+        mi.set_variant(variant)
+    return found
+
+
+@case
+def bitmaps_of_colours(patch: Patch) -> Any:
+    """`raw` is removed from colours only. Colours need files of linear colours."""
+    picture("rgb.exr", 2, 2, 3)
+    picture("bytes.png", 2, 2, 3, kind=np.uint8)
+    picture("grey.png", 2, 2, 1, kind=np.uint8)
+    texture = '<texture type="bitmap" name="{}">{}<string name="filename" value="{}"/></texture>'
+    found = []
+    for name in ("reflectance", "roughness"):
+        for file in ("rgb.exr", "bytes.png", "grey.png", "gone.png"):
+            for raw in ("", '<boolean name="raw" value="true"/>', '<boolean name="raw" value="false"/>'):
+                description = described(f'<bsdf type="diffuse" id="a">{texture.format(name, raw, file)}</bsdf>')
+                fault = ending(mend.upsample_bitmaps, description)
+                found.append([name, file, raw[27:31], fault, any("raw" in line for line in lines(description.root))])
+    return found
+
+
+@case
+def resized_films(patch: Patch) -> Any:
+    """Films with other sizes and with crop windows, and a sensor without a film."""
+    crop = '<film type="specfilm" id="f"><integer name="width" value="5"/><integer name="crop_width" value="2"/></film>'
+    found = []
+    for text in (f"<sensor type='perspective'>{FILM}</sensor><sensor type='thinlens'>{crop}</sensor>",
+                 "<sensor type='perspective'/>"):  # fmt: skip
+        description = described(text)
+        build.resize_films(description, (7, 3))
+        kept = [[child.name for child in sizes] for sizes in description.own_sizes.values()]
+        found.append([lines(description.root), kept])
     return found
 
 
