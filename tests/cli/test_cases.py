@@ -21,8 +21,20 @@ import pytest
 from cli.tiny import reslrb, write_experiment
 from golden.cases import Cases, ending
 
-from reslrb_cli import cli
-from reslrb_cli.cli import bench, convergence, gradcheck, init, jobs, options, render, sweep, terminal
+from reslrb_cli import cli, errors
+from reslrb_cli.cli import (
+    bench,
+    convergence,
+    example,
+    gradcheck,
+    init,
+    jobs,
+    optimize,
+    options,
+    render,
+    sweep,
+    terminal,
+)
 from reslrb_cli.records import checkpoint
 from reslrb_cli.records.manifest import PROGRAM
 from reslrb_cli.records.measurements import BenchStatus, MissingRecord
@@ -368,6 +380,70 @@ def files_of_comparisons(patch: Patch) -> Any:
         asked: Any = SimpleNamespace(json_file=None, draws=None)
         with pytest.raises(KeyboardInterrupt):
             convergence._run(plan, asked, 0.0)
+    return found
+
+
+@case
+def copied_examples(patch: Patch) -> Any:
+    """Into a new folder, into one that has a file of that name, and into a file."""
+    known = [*example.examples().values()]
+    path = min(known, key=lambda each: len(each.read_text()))
+    Path("file").touch()
+    Path("taken/scenes").mkdir(parents=True)
+    Path("taken", path.name).touch()
+    Path("linked").mkdir()
+    Path("linked", path.name).symlink_to("gone")
+    ends = [ending(lambda name=name: str(example.copy(path, Path(name)))) for name in ("new/deep", "taken", "file",
+                                                                                       "linked")]  # fmt: skip
+    copies = {str(each): each.stat().st_size > 0 for each in sorted(Path("new").rglob("*")) if each.is_file()}
+    return ends, copies, [line for line in Path("new/deep", path.name).read_text().splitlines() if "scenes" in line]
+
+
+@case
+def resumed_runs(patch: Patch) -> Any:
+    """All that happens before a run continues, with and without workers, and if it is complete."""
+    found: list[Any] = []
+
+    def noted(name: str, result: Any = None) -> Any:
+        return lambda *given: (found.append([name, *given]), result)[1]
+
+    for name, result in (("echo", None), ("_check_shards", None), ("start_variant", "v"), ("_callbacks", ["c"]),
+                         ("_run", 0)):  # fmt: skip
+        patch.setattr(optimize, name, noted(name, result))
+    patch.setattr(optimize.logger, "info", noted("info"))
+    config = SimpleNamespace(run=SimpleNamespace(iterations=9), model_copy=lambda update: ["config with", update])
+    given: Any = SimpleNamespace(overrides=["o"], allow_code=True, quiet=True)
+    for is_done, workers in ((True, None), (False, None), (False, SimpleNamespace(check=noted("workers")))):
+        earlier = SimpleNamespace(
+            is_done=is_done, done_line=lambda *words: words, settled=SimpleNamespace(variant="stored"), iteration=4,
+            config=SimpleNamespace(with_code=lambda allowed: (found.append(allowed), config)[1]),
+            begin=lambda variant, *tell: ["begun", variant, len(tell)],
+        )  # fmt: skip
+        patch.setattr("reslrb_cli.runs.resume.open_earlier", lambda *given, made=earlier: nullcontext(made))
+        found.append(optimize._resume(Path("run"), given, workers))
+    return [[str(part).split("(")[0] for part in each] if isinstance(each, list) else each for each in found]
+
+
+@case
+def code_of_measurements(patch: Patch) -> Any:
+    """Own losses run only if a measurement needs them, and the user permits it."""
+    write_experiment(Path())
+    Path("own.py").write_text("import mitsuba as mi\n\ndef own(image):\n    return image\n")
+
+    def end(*given: Any, **more: Any) -> Any:
+        raise errors.ConfigError("measured", "", "nothing")
+
+    patch.setattr(convergence, "convergence_plan", end)
+    patch.setattr("reslrb_cli.measure.missing.MissingCheck.of_config", end)
+    patch.setattr("reslrb_cli.measure.participants.CheckSettings", end)
+    found = []
+    for words in (["convergence"], ["convergence", "--objective", "loss"], ["convergence", "--objective", "image"],
+                  ["gradcheck"], ["gradcheck", "--missing"], ["render", "-o", "x.exr"]):  # fmt: skip
+        for allowed in ((), ("--allow-code",)):
+            result = reslrb(
+                words[0], "tiny.yaml", *words[1:], "--set", "loss={type: custom, file: own.py:own}", *allowed
+            )
+            found.append([*words, *allowed, result.exit_code, *result.stderr.splitlines()[-1:]])
     return found
 
 

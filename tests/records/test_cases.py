@@ -8,7 +8,9 @@ import errno
 import itertools
 import json
 import os
+import subprocess
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +27,9 @@ from reslrb_cli.records import (
     atomic,
     checkpoint,
     decisions,
+    images,
     lock,
+    manifest,
     measurement_files,
     measurements,
     metrics,
@@ -237,6 +241,42 @@ def pages_in_progress(patch: Patch) -> Any:
             now[0] += 0.5
         found.append(written)
     return found
+
+
+# ---- Masks and commits ----
+
+
+@case
+def masks_of_parameters(patch: Patch) -> Any:
+    """Masks of a texture and of a mesh, with letters that a name of a file cannot have, and damaged ones."""
+    found: list[Any] = []
+    for key, mask in (("a.b", np.array([True, False, True])), ("a/b c", np.array([[True, False], [False, True]]))):
+        found.append(images.read_mask(Path(), key))
+        images.write_mask(Path(), key, mask)
+        found += [images.read_mask(Path(), key), sorted(os.listdir())]
+    for name, content in (("empty", b""), ("torn", Path("a.b.mask.npy").read_bytes()[:-1]), ("pickle", b"\x80\x04")):
+        Path(f"{name}.mask.npy").write_bytes(content)
+        found.append(images.read_mask(Path(), name))
+    np.save("numbers.mask.npy", np.ones(3))
+    return [*found, images.read_mask(Path(), "numbers")]
+
+
+@case
+def commits_of_folders(patch: Patch) -> Any:
+    """Git answers, finds no commit, is missing, or is too slow."""
+    asked: list[Any] = []
+
+    def answer(words: Any, given: Any = None, **more: Any) -> Any:
+        asked.append([words, more])
+        if isinstance(given, Exception):
+            raise given
+        return SimpleNamespace(stdout=given)
+
+    found = []
+    for given in ("abc\n", "", FileNotFoundError("git"), subprocess.TimeoutExpired("git", 10), ValueError("null byte")):
+        patch.setattr(manifest.subprocess, "run", partial(answer, given=given))
+        found.append(manifest.commit_of(Path("a")))
+    return found, asked[0]
 
 
 # ---- Decisions, locks and unfinished files ----

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
+import re
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,7 +23,7 @@ from records.test_metrics import make_record
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.records import checkpoint, lock, manifest, run_folder
 from reslrb_cli.records.manifest import PROGRAM
-from reslrb_cli.runs import prepare, recorder
+from reslrb_cli.runs import callbacks, loggers, prepare, recorder
 from reslrb_cli.scene import files
 
 Patch = pytest.MonkeyPatch
@@ -57,6 +59,13 @@ def changed_settings(patch: Patch) -> Any:
         different = prepare.changes(start, now)
         found.append([sets, different, ending(prepare.check_changes, different, "by {}".format, Path("run"), now)])
     return found
+
+
+@case
+def flat_settings(patch: Patch) -> Any:
+    """All settings, as JSON, without those that are not set."""
+    found = prepare.flat(config_of("target={file: target.exr}", "parameters[0].initial={file: values.exr}"))
+    return json.loads(json.dumps(found))
 
 
 @case
@@ -439,7 +448,8 @@ def course_of(*sets: str, done: int = 3, stopped: str = "", **problem: Any) -> A
     views = [SimpleNamespace(sensor=0), SimpleNamespace(sensor=2)]
     tallies = {name: SimpleNamespace(iterations=2, to_json=lambda name=name: f"the {name}") for name in
                ("nonfinite", "regularized")}  # fmt: skip
-    results = SimpleNamespace(end=lambda: None, to_json=lambda: {"loss_trend": 1})
+    ended: list[bool] = []
+    results = SimpleNamespace(end=lambda: ended.append(True), to_json=lambda: {"loss_trend": len(ended)})
     last = make_record(iteration=done - 1, loss=float("nan"))
     return SimpleNamespace(
         problem=SimpleNamespace(config=config_of(*sets), **{"views": views, "masks": {}, **problem}), done=done,
@@ -454,7 +464,69 @@ def results_of_a_recording(patch: Patch) -> Any:
     made = recording(course=course_of())
     made.manifest.incomplete = [{"parameter": "a"}]
     full = recording(course=course_of(stopped="enough"), certainty=certainty, unmeasured=["b"], seen={"-0": 1})
-    return [each._found() for each in (made, full, recording(course=course_of(done=0)))]
+    recordings = [made, full, recording(course=course_of(done=0))]
+    for design, certain in itertools.product((None, "lens"), (False, True)):
+        course = course_of()
+        course.problem.config = SimpleNamespace(fabrication=design, run=SimpleNamespace(certainty=certain))
+        recordings.append(recording(course=course))
+    return [each._found() for each in recordings]
+
+
+@case
+def final_images(patch: Patch) -> Any:
+    """The manifest gets the results after the images are written."""
+    made = recording(course=course_of(), _found=lambda: found.copy(), _write_images=lambda name: found.append(name))
+    found: list[str] = []
+    made._write_final_images()
+    return made.manifest.results
+
+
+@case
+def measured_scales(patch: Patch) -> Any:
+    lines: list[Any] = []
+    patch.setattr(recorder.logger, "log", lambda level, line: lines.append([level, line]))
+    patch.setattr(recorder, "scale_line", lambda row: f"curvature {row.curvature}")
+    made = recording(course=course_of("optimizer={type: sgd, scale: curvature}"))
+    rows = [SimpleNamespace(curvature=each, to_json=lambda each=each: {"curvature": each}) for each in (None, 0.0, 2.0)]
+    made._tell_scaling(rows)
+    return lines, made.manifest.scaling
+
+
+# ---- Callbacks ----
+
+
+def callback_of(module: str, optional: bool) -> Any:
+    """Return a callback from a module of this name that fails."""
+
+    def fail(self: object, *given: object) -> None:
+        raise ValueError("no")
+
+    parts = {"__module__": module, "optional": optional, "begin": fail, "iteration": fail}
+    return type("Own", (callbacks.Callback,), parts)()
+
+
+@case
+def failing_callbacks(patch: Patch) -> Any:
+    """Callbacks from a file, and from a module without a file. The run goes on without optional ones."""
+    lines: list[Any] = []
+    patch.setattr(callbacks.logger, "warning", lambda *given: lines.append([*map(str, given)]))
+    found = []
+    for module, optional, name in itertools.product((__name__, "nowhere"), (False, True), ("begin", "iteration")):
+        one = callback_of(module, optional)
+        calls = callbacks.Calls([one, callbacks.Callback()], "run", "manifest")  # type: ignore[arg-type]
+        end = str(ending(calls._call, one, name))
+        found.append([module != "nowhere", optional, name, end, len(calls._callbacks)])
+    return json.loads(re.sub(r"line \d+", "line N", json.dumps([found, lines])))
+
+
+@case
+def given_callbacks(patch: Patch) -> Any:
+    own = callback_of("nowhere", False)
+    found = []
+    for given in ("text", 3, (), [own], [own, own], [callbacks.Callback], [int], [3], ["nobody"], ["a.py:Own"]):
+        made = ending(loggers.callbacks_of, config_of(), given, "--log")
+        found.append(made.split(" at 0x")[0] if isinstance(made, str) else [type(each).__name__ for each in made])
+    return found
 
 
 @case
