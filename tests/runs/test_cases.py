@@ -556,12 +556,17 @@ def measurements_of_certainty(patch: Patch) -> Any:
         course.problem.config = SimpleNamespace(run=course.problem.config.run, by_pixel=by_pixel)
         course.certainty = SimpleNamespace(
             measure=lambda *given, asked=asked, measured=measured: asked.append(given) or measured,
-            shown={"k": 1, "l": 2},
-        )
+            shown={"k": 1, "l": 2}, misfits={2: "the misfit of 2"},
+        )  # fmt: skip
         patch.setattr(recorder, "write_mask", lambda folder, key, mask, asked=asked: asked.append([key, mask]))
+        patch.setattr(recorder, "write_file", lambda *given, asked=asked, **more: asked.append([*given, more]))
         made = recording(course=course)
+        Path("run/images").mkdir(parents=True, exist_ok=True)
+        for sensor in (0, 2):
+            Path(f"run/images/{made._image_name('misfit', sensor)}.exr").touch()
         made._measure_certainty()
-        found.append([asked, made.certainty, made.unmeasured])
+        left = sorted(os.listdir("run/images"))
+        found.append([asked, made.certainty, made.unmeasured, left])
     return found
 
 
