@@ -288,6 +288,16 @@ def test_samples_on_file_are_not_drawn_again(variant: str, tmp_path: Path, reque
     assert records(4) == (more, 0)
 
 
+def test_every_parameter_has_its_own_rounding_error():
+    two = "parameters=[{key: red.reflectance.value}, {key: green.reflectance.value}]"
+    made = Gradcheck(CheckSettings(box(two, "scene.options.size=8"), estimators_of("stack"), 0, 1))
+    made.rows = [row for row in made.rows if row.kind is Kind.EQUAL_SEEDS]
+    sample = np.append(np.ones(made.participants.case.size), [1e-4, 0.5])
+    made.draws = {name: [sample] for row in made.rows for name in made._needs(row)}
+    found = {record.parameter: record.relative_l2_limit for record in made.records() if record.seeds}
+    assert found == {"red.reflectance.value": 1e-4, "green.reflectance.value": 0.5}
+
+
 def test_estimators_have_the_options_of_the_configuration():
     config = box("integrator.estimator=reservoir", "integrator.capacity=4")
     assert [case.label for case in all_estimators(config)] == [

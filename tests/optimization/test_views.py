@@ -15,7 +15,7 @@ from optimization.toy import make_problem
 from reslrb_cli.config.loader import dump, load, loads
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.measure.gradcheck import Gradcheck
-from reslrb_cli.measure.methods import parse_cases, parse_checked
+from reslrb_cli.measure.methods import all_estimators, parse_cases, parse_checked
 from reslrb_cli.measure.missing import MissingCheck
 from reslrb_cli.measure.participants import CheckSettings
 from reslrb_cli.optimization import loop
@@ -189,10 +189,12 @@ def test_measurements_have_the_first_view_with_all_lamps(lamps, method):
 
 def test_gradcheck_has_the_lamps_of_the_first_view(lamps):
     """The images are those of the view, and naive AD traces the same paths."""
-    problem = make(lamps, ONE_BY_ONE, "run.shards=1", "target.render.spp=256")
+    problem = make(lamps, ONE_BY_ONE, "run.shards=1", "target.render.spp=256", "integrator.guiding=auto")
     size = np.array(problem.views[0].target).mean()
     check = Gradcheck(CheckSettings(problem.config, parse_checked("reslrb:stack"), 0, 3, spp=64))
     parts = check.participants
+    # Views with different lamps share no tables.
+    assert "reslrb:stack(guiding=on)" not in [case.label for case in all_estimators(problem.config)]
     assert check.conditions().endswith(", the first view with the lamps led0")
     assert [(one, why.count("it cannot switch lamps off")) for one, why in parts.images.values()] == [(None, 3)]
     for name in ("walk_ad", "differenced", "reslrb:stack"):
