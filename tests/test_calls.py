@@ -144,6 +144,8 @@ render.parse_values([" a = [1, 2] ", "b={file: x}"])
 [terminal.tell(error) for error in (errors.ConfigError("a", "b", "c"), KeyboardInterrupt(), ZeroDivisionError())]
 [connection.Cluster.parse(text) for text in ("local:1", "local:1024", "tls://a:1", "tls://[::1]:65535")]
 [connection.Cluster.parse(text) for text in ("local:01025",)], 0
+[connection.Cluster.parse(text) for text in ("remote:3",)], 0
+sweeps.SweepPlan("c", [], [], [1]).keys, [plan.keys for plan in plans()]
 [connection.Cluster.parse(text) for text in ("tls://a:65536",)], 0
 connection.Cluster(10**6).threads, connection.Cluster(address="a").threads
 [cameras.sensor_id(name) for name in ("a-b.c", "", "--", "é1")]

@@ -369,6 +369,23 @@ def distributions_of_a_search(patch: Patch) -> Any:
     return found, [search._to_optuna(each, each.overrides[0].value) for each in varied]
 
 
+@case
+def comparable_searches(patch: Patch) -> Any:
+    """Settings that change the loss, the target, the scene or neither, with targets whose values are known or not."""
+    patch.setattr(search, "load_optuna", lambda: None)
+    found = []
+    for key in ("optimizer.learning_rate", "loss.type", "target.file", "scene.file", "run.held_out"):
+        two = [sweeps.Combination(name, {key: name}) for name in "ab"]
+        for targets in ([(None, True), (None, True)], [(None, True), (None, False)], [({}, False), (None, False)],
+                        [({}, False), ({}, False)]):  # fmt: skip
+            configs = {n: SimpleNamespace(target=SimpleNamespace(render=render, truth=truth))
+                       for n, (render, truth) in enumerate(targets)}  # fmt: skip
+            plan: Any = SimpleNamespace(sweep=sweeps.SweepPlan("c", [], two, [1]), configs=configs)
+            found.append([key, targets, ending(search.check_search, plan)])
+    empty: Any = SimpleNamespace(sweep=sweeps.SweepPlan("c", [], [], [1]), configs={})
+    return [*found, ending(search.check_search, empty)]
+
+
 # ---- Records ----
 
 

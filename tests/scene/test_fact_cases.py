@@ -90,6 +90,20 @@ def facts_of_scenes(patch: Patch) -> Any:
 
 
 @case
+def nested_surfaces(patch: Patch) -> Any:
+    """BSDFs within BSDFs, without their textures, and the BSDFs that own them."""
+    chequered = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
+    blend = {"type": "blendbsdf", "weight": {"type": "checkerboard"}, "a": {**MASK, "bsdf": chequered}, "b": MIRROR}
+    found = []
+    for bsdf in (WHITE, chequered, MASK, blend, {"type": "twosided", "bsdf": {**blend, "a": chequered}},
+                 {"type": "bumpmap", "arbitrary": {"type": "checkerboard"}, "bsdf": COAT}):  # fmt: skip
+        at = SceneGraph.of(scene_of(wall=wall(bsdf)))
+        found.append([[inner.class_name() for inner in at.nested_bsdfs(each)] for each in at.surface_bsdfs()])
+        found[-1] += [[each.class_name() for each in at.owning_bsdfs(inner)] for inner in at.of_type(mi.BSDF)]
+    return found
+
+
+@case
 def paths_of_several_sensors(patch: Patch) -> Any:
     """Each order of a sensor that any paths can render and one that camera paths cannot, still and with motions."""
     meter = {"type": "irradiancemeter", "film": {"type": "hdrfilm"}}

@@ -253,7 +253,10 @@ BY_WAVELENGTH = f"""<sensor type="perspective">{FILM}</sensor>
 <shape type="sphere" id="d"><bsdf type="roughconductor"><spectrum name="eta" value="400:0.3, 700:0.5"/>
 <spectrum name="k" value="2"/></bsdf></shape>
 <emitter type="point" id="lamp"><spectrum name="intensity" value="400:3, 700:5"/></emitter>
-<emitter type="point" id="spot"><rgb name="intensity" value="1 2 3"/></emitter>"""
+<emitter type="point" id="spot"><rgb name="intensity" value="1 2 3"/></emitter>
+<emitter type="point" id="grey"><spectrum name="intensity" value="3"/></emitter>
+<emitter type="point" id="day"><texture type="d65" name="intensity" id="light"><rgb name="color" value="0.2 0.9 0.4"/>
+<float name="scale" value="3"/></texture></emitter>"""
 
 
 @case
