@@ -36,7 +36,7 @@ from reslrb_cli.optimization.optimizers import SMALL_HEIGHTMAP
 from reslrb_cli.optimization.problem import Problem, make_optimizer, make_regularizers
 from reslrb_cli.optimization.state import begin_as, decide_as, reach_as
 from reslrb_cli.optimization.targets import make_targets
-from reslrb_cli.optimization.views import expose, make_views
+from reslrb_cli.optimization.views import expose, make_views, response_costs
 from reslrb_cli.records.decisions import DecisionCache
 from reslrb_cli.records.tree import Stored
 from reslrb_cli.scene.deformation import where_moved
@@ -199,7 +199,7 @@ def assemble_scene(config: Config, scene: Any = None, keys: Iterable[str] = ()) 
         moves=moves,
         optimizer=make_optimizer(config, selection),
         samples_per_pass=samples_per_pass(config),
-        regularizers=make_regularizers(selection),
+        regularizers=make_regularizers(selection) | response_costs(views),
         quantities={
             key: "" if key in selection.factors else motions.get(key) or quantity(selection.params, key)
             for key in selection.keys

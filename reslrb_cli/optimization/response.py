@@ -8,11 +8,14 @@ The target T is decoded as the recovery starts, and does not change. The respons
 The gain depends on the target alone, so the loss of a noisy image has the same bias as without a response. A response
 that maps all values to 0 does not reduce the loss, because the target keeps its values. The derivative with respect to
 s_k is the sum of -B_k dL/dI I over pixels and channels, from the same samples as the derivative of an exposure.
+
+Hardly any pixel may show a contrast of a curve. Noise would then move the contrast far, and shorten the joint steps of
+all parameters. A weak cost (`Smoothness`) ties it to its neighbours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,6 +26,9 @@ import numpy as np
 from reslrb_cli.scene.response import basis, shown, start
 
 Array = np.ndarray[Any, Any]
+
+#: Cost of neighbouring contrasts whose logarithms differ by 1, as a share of the loss of a black image.
+SMOOTHNESS = 1e-4
 
 
 @dataclass
@@ -73,3 +79,21 @@ class RecoveredResponse:
         for place, part in enumerate(self._basis):
             dr.scatter(total, -dr.sum(part.array * products), mi.UInt32(place))
         dr.accum_grad(leaf, total)
+
+
+class Smoothness:
+    """Cost of the contrasts s of a curve: the sum of (ln s_(k+1) - ln s_k)² times `SMOOTHNESS`, and times the loss of a
+    black image, which `scale` returns. The cost has the form of a regularizer's (`regularizers.Cost`).
+    """
+
+    def __init__(self, scale: Callable[[], float]) -> None:
+        self._scale = scale
+        self._weight: float | None = None
+
+    def __call__(self, numbers: Array) -> tuple[float, Array]:
+        """Return the cost of the contrasts (K,), and its gradient (K,)."""
+        if self._weight is None:  # the target does not exist before
+            self._weight = SMOOTHNESS * self._scale()
+        change = np.diff(np.log(numbers))
+        slope = np.concatenate([[0.0], change]) - np.concatenate([change, [0.0]])
+        return self._weight * float(change @ change), 2 * self._weight * slope / numbers

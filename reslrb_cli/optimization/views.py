@@ -32,7 +32,8 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors, find_sensor
 from reslrb_cli.optimization.losses import SSIM_SIDE, Loss, OwnLoss, blur, l2, make_loss, weighted
-from reslrb_cli.optimization.response import RecoveredResponse
+from reslrb_cli.optimization.regularizers import Cost
+from reslrb_cli.optimization.response import RecoveredResponse, Smoothness
 from reslrb_cli.records.run_folder import exposed
 from reslrb_cli.scene.cameras import read_cameras, sensor_id
 from reslrb_cli.scene.parameters import Selection
@@ -417,6 +418,20 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
             each = view.per_channel and color_channels(scene.sensors()[view.sensor].film()) == 3
             one = mi.Color3f(1) if each else mi.Float(1)
             selection.add_factor(key, one + dr.opaque(mi.Float, 0), Settings(initial=1.0, transform="log"))
+
+
+def response_costs(views: list[View]) -> dict[str, dict[str, Cost]]:
+    """Return the costs of recovered curves, by key and type, as `problem.make_regularizers` returns them."""
+
+    def scale(own: list[View]) -> float:
+        black = [view.judge(dr.zeros(mi.TensorXf, view.target.shape)) for view in own]
+        return sum(view.share * float(loss[0]) for view, loss in zip(own, black, strict=True))
+
+    seen: dict[str, list[View]] = {}
+    for view in views:
+        if view.response is not None and view.response.kind == "curve" and not view.held_out:
+            seen.setdefault(view.response.key, []).append(view)
+    return {key: {"smoothness": Smoothness(functools.partial(scale, own))} for key, own in seen.items()}
 
 
 def color_channels(film: mi.Film) -> int:

@@ -18,12 +18,15 @@ from PIL import Image
 import reslrb_cli as rl
 from reslrb_cli.config.loader import load
 from reslrb_cli.errors import ConfigError
-from reslrb_cli.optimization.assemble import assemble
+from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.uncertainty import candidates, fit
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
+from reslrb_cli.optimization.uncertainty.response import may_have_response
+from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.report.spread import misfit_lines
 from reslrb_cli.runs.prepare import with_freed
+from reslrb_cli.scene.response import SRGB
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -127,6 +130,11 @@ def test_the_gain_is_that_of_a_known_response(folder, response):
     # The light of the target is shown as the target.
     light = np.array(view.target) * np.array(image) / np.array(view.exposed(image))
     np.testing.assert_allclose(view.shown_array(light)[seen], np.array(view.target)[seen], rtol=1e-3)
+    assert np.all(view.shown_array(1.2 * light)[seen] > 1.05 * np.array(view.target)[seen])
+    # Another process has the same gain.
+    other = with_numbers(assemble_scene(problem.config), "response", numbers)
+    set_targets(other.views, target_arrays(problem.views))
+    np.testing.assert_array_equal(np.array(other.views[0].exposed(image)), np.array(view.exposed(image)))
 
 
 @pytest.mark.parametrize("response", NUMBERS)
@@ -156,6 +164,20 @@ def test_the_entries_of_a_response_are_judged_one_by_one(folder):
     problem = make(folder, "target.response={curve: auto}")
     assert problem.optimizer.is_small("response")
     assert problem.optimizer.block.at["response"].stop - problem.optimizer.block.at["response"].start == 6
+
+
+def test_contrasts_that_no_pixel_shows_follow_their_neighbours(folder):
+    """The cost's gradient agrees with differences, and is 0 if all contrasts are equal. A gamma has no cost."""
+    problem = make(folder, "target.response={curve: auto}")
+    values = np.array([1, 1.2, 0.8, 2, 3, 1.5])
+    costs = [problem.costs({"response": values + 1e-4 * unit})[0]["response"]["smoothness"] for unit in np.eye(6)]
+    cost, gradient = problem.costs({"response": values})
+    assert cost["response"]["smoothness"] == pytest.approx(0.6e-4 * np.sum(np.diff(np.log(values)) ** 2), rel=0.6)
+    np.testing.assert_allclose(
+        (np.array(costs) - cost["response"]["smoothness"]) / 1e-4, gradient["response"], rtol=2e-3
+    )
+    np.testing.assert_allclose(problem.costs({"response": np.full(6, 1.3)})[1]["response"], 0, atol=1e-12)
+    assert make(folder, "target.response={gamma: auto}").regularizers == {}
 
 
 def test_views_share_a_response_or_have_their_own(folder):
@@ -203,9 +225,28 @@ def test_a_run_names_the_response_that_explains_the_misfit(tmp_path, curve, is_n
         first = found.candidates[0]
         assert first.explained > 0.5
         assert first.p < 1e-3
+        assert not first.proposed or first.proposed[4] > 1.5 > first.proposed[2]  # as the film curve has it
         assert misfit_lines({"certainty": {"fit": found.to_json()}})[2].startswith(
             "  target.response: {curve: auto}  # "
         )
+
+
+@pytest.mark.parametrize(("sets", "may"), [
+    ([], True), (["target.response=srgb"], True), (["target.response=linear"], False), (["target.exposure=2"], False),
+    (["target.response={gamma: 2}"], False), (["target.response={curve: auto}"], False),
+    (["target.white_balance={scene: A}"], False),
+])  # fmt: skip
+def test_a_response_is_tested_if_it_could_be_recovered(folder, sets, may):
+    assert may_have_response(make(folder, *sets)) == may
+
+
+def test_callers_that_need_the_scene_alone_use_the_first_response(folder):
+    views = "views=[{target: photo0.png, exposure: auto, response: {gamma: auto}}]"
+    config = load(
+        folder / "room.yaml", ["target={response: {curve: auto}, exposure: auto}", views]
+    ).with_exposures_fixed()
+    assert (config.target.response, config.target.exposure) == (SRGB, 1)
+    assert (config.views[0].response.gamma, config.views[0].exposure) == (2.2, 1)
 
 
 def test_free_recovers_the_response(folder):
