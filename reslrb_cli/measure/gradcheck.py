@@ -140,30 +140,22 @@ class Gradcheck:
 
         A sample that has started is finished. `between` is called after each sample, and `say` from time to time.
         """
-        try:
-            for _ in self._turns(stop, say):
-                between()
-        finally:
-            self.file.save()
-
-    def _turns(self, stop: Callable[[], bool], say: Callable[[str], None]) -> Iterator[None]:
         names = list(dict.fromkeys(name for row in self.rows for name in self._needs(row)))
-        for name in names:
-            if name not in self.draws:
-                self.draws[name] = self._recall(name)
+        self.draws |= {name: self._recall(name) for name in names if name not in self.draws}
         if known := sum(map(len, self.draws.values())):
             say(f"{known} of {len(names) * self.seeds} samples are on file")
-        for number, seed in enumerate(seeds(self.seeds)):
-            for name in names:
-                if len(self.draws[name]) > number:
-                    continue
-                if stop() or self._now() - self._begin >= self._budget_s:
-                    return
-                self._take(name, seed)
-                yield
-            if number & (number + 1) == 0:
-                self.file.save()
-                say(f"{number + 1} of {self.seeds} seeds, {self._now() - self._begin:.0f} s")
+        try:
+            for number, seed in enumerate(seeds(self.seeds)):
+                for name in (name for name in names if len(self.draws[name]) <= number):
+                    if stop() or self._now() - self._begin >= self._budget_s:
+                        return
+                    self._take(name, seed)
+                    between()
+                if number & (number + 1) == 0:
+                    self.file.save()
+                    say(f"{number + 1} of {self.seeds} seeds, {self._now() - self._begin:.0f} s")
+        finally:
+            self.file.save()
 
     def _recall(self, name: Name) -> list[np.ndarray]:
         """Return the samples on file, and restore their finite-difference steps."""
