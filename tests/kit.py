@@ -93,10 +93,13 @@ def shape(kind: str, id: str, *parts: str, place: str = "") -> str:
 
 
 def profile_of(space: str, gamma: float) -> bytes:
-    """Return an ICC profile with the primaries of an RGB space of colour-science, and a power as its curve."""
+    """Return an ICC profile with the primaries of an RGB space of colour-science, and a power as its curve. With
+    `space="grey"`, it is a profile of grey images.
+    """
     import colour
 
-    to_xyz = colour.RGB_COLOURSPACES[space].matrix_RGB_to_XYZ
+    is_grey = space == "grey"
+    to_xyz = colour.RGB_COLOURSPACES["sRGB" if is_grey else space].matrix_RGB_to_XYZ
     white = to_xyz.sum(axis=1)
     adapted = colour.adaptation.matrix_chromatic_adaptation_VonKries(white, [0.9642, 1, 0.8249], "Bradford") @ to_xyz
 
@@ -111,12 +114,15 @@ def profile_of(space: str, gamma: float) -> bytes:
     tags |= {b"wtpt": b"XYZ \0\0\0\0" + fixed([0.9642, 1, 0.8249])}
     curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(256 * gamma)) + b"\0\0"
     tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
+    if is_grey:
+        tags = {name: tags[name] for name in (b"desc", b"wtpt")} | {b"kTRC": curve}
     table, body, start = b"", b"", 132 + 12 * len(tags)
     for name, content in tags.items():
         content += bytes(-len(content) % 4)
         table += name + struct.pack(">II", start + len(body), len(content))
         body += content
     body = struct.pack(">I", len(tags)) + table + body
-    head = struct.pack(">I4sI4s4s4s", 128 + len(body), b"lcms", 0x02100000, b"mntr", b"RGB ", b"XYZ ")
+    kind = b"GRAY" if is_grey else b"RGB "
+    head = struct.pack(">I4sI4s4s4s", 128 + len(body), b"lcms", 0x02100000, b"mntr", kind, b"XYZ ")
     head = head + bytes(12) + b"acsp" + bytes(28) + fixed([0.9642, 1, 0.8249]) + bytes(48)
     return head + body

@@ -72,6 +72,7 @@ def first_configurations(patch: Patch) -> Any:
         {"sensors": list("abcdef")}, {"sensors": list("abcdefg")}, {"target": None},
         {"target": None, "sensors": ["a", "b"]}, {"is_integer": True}, {"is_integer": True, "is_raw": True},
         {"is_raw": True}, {"proposals": proposals(2, 1, "emitter")},
+        {"is_integer": True, "proposals": [*proposals(2, 2), *proposals(1, 1, "emitter")]},
         {"is_integer": True, "proposals": proposals(2, 1, "emitter")}, {"proposals": proposals(62, 2)},
         {"proposals": proposals(63, 2)}, {"movable": moved}, {"reason": "a reason"}, {"hides_emitters": True},
         {"hides_emitters": True, "target": None}, {"missing": 0.2}, {"depth": 2},

@@ -582,6 +582,16 @@ def values_that_are_not_finite(patch: Patch) -> Any:
 
 
 @case
+def stopped_runs(patch: Patch) -> Any:
+    """The line about a run that has stopped by itself."""
+    lines: list[str] = []
+    patch.setattr(recorder.logger, "info", tell(lines))
+    patch.setattr(recorder, "iterate", lambda *given: iter([len(given)]))
+    found = [[*recording(course=course_of(stopped=why))._iterations()] for why in ("", "enough")]
+    return found, lines
+
+
+@case
 def live_pages(patch: Patch) -> Any:
     written: list[Any] = []
     patch.setattr(recorder, "write_report", lambda *given: written.append([str(given[0]), *given[1:]]))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from golden import said
 from golden.cases import Cases, ending
+from kit import profile_of
 
 from reslrb_cli.config.loader import loads
 from reslrb_cli.config.parameters import ParameterSpec
@@ -320,6 +321,18 @@ def smaller_photographs(patch: Patch) -> Any:
             fault = ending(proposal.write_smaller, photo, (3, 2), path, raw)
             bitmap = mi.Bitmap(str(path)) if path.exists() else None
             found.append([name, raw, fault, bitmap and [str(bitmap.component_format()), np.array(bitmap)]])
+    return found
+
+
+@case
+def colour_profiles(patch: Patch) -> Any:
+    """Names of profiles that differ from sRGB, and colours that they convert."""
+    colours = np.arange(0, 256, 51, dtype=np.uint8).reshape(1, 2, 3)
+    found: list[Any] = [images.foreign_profile(b""), images.foreign_profile(b"x" * 200)]
+    for space, gamma in itertools.product(("grey", "sRGB", "Display P3"), (1.0, 1.8, 2.2)):
+        profile = profile_of(space, gamma)
+        given = colours[:, :, :1] if space == "grey" else colours
+        found.append([space, gamma, images.foreign_profile(profile), images._converted(given, profile)])
     return found
 
 

@@ -298,6 +298,16 @@ def bitmaps_of_colours(patch: Patch) -> Any:
 
 
 @case
+def raw_colours(patch: Patch) -> Any:
+    """Colours that the scene calls raw stay as they are in variants of RGB."""
+    picture("bytes.png", 2, 2, 3, kind=np.uint8)
+    texture = '<texture type="bitmap" name="reflectance"><boolean name="raw" value="true"/>{}</texture>'
+    file = '<string name="filename" value="bytes.png"/>'
+    description = described(f'<bsdf type="diffuse">{texture.format(file)}</bsdf>')
+    return ending(mend.mend, description, []), lines(description.root)
+
+
+@case
 def resized_films(patch: Patch) -> Any:
     """Films with other sizes and with crop windows, and a sensor without a film."""
     crop = '<film type="specfilm" id="f"><integer name="width" value="5"/><integer name="crop_width" value="2"/></film>'
