@@ -320,7 +320,8 @@ def smaller_photographs(patch: Patch) -> Any:
             path = Path(f"small-{raw}-{name}")
             fault = ending(proposal.write_smaller, photo, (3, 2), path, raw)
             bitmap = mi.Bitmap(str(path)) if path.exists() else None
-            found.append([name, raw, fault, bitmap and [str(bitmap.component_format()), np.array(bitmap)]])
+            tagged = path.exists() and [tag for tag in ("gAMA", "sRGB", "cHRM") if tag.encode() in path.read_bytes()]
+            found.append([name, raw, fault, bitmap and [str(bitmap.component_format()), np.array(bitmap)], tagged])
     return found
 
 
