@@ -43,7 +43,7 @@ OPTIMIZERS: dict[str, Callable[..., Any]] = {
 #: Extent of a parameter with a transform, in units of u.
 EXTENT_OF_TRANSFORM = 2.0
 #: Largest number of entries of a parameter that `auto` moves together with others, and of texels of a heightmap.
-SMALL, SMALL_HEIGHTMAP = 6, 32
+SMALL, SMALL_HEIGHTMAP = 4, 32
 #: Longest step of these parameters and of motions as a share of the extent, and in the unit of a transform.
 LONGEST_OF_SMALL, LONGEST_OF_MOTION, LONGEST_OF_TRANSFORM = 0.25, 0.1, 0.3
 
@@ -52,9 +52,10 @@ class Optimizer:
     """Optimiser that holds and updates the parameters. Gradients accumulate in the values that the optimiser returns.
 
     `rates`, `bounds`, `transforms` and `smoothers` have the parameters' keys. A rate of None stands for
-    `learning_rate`. Bounds of None set no bounds. Transforms and smoothers may be missing. Values and gradients belong
-    to the scene's parameters, not to the optimiser's variables. The optimiser moves a parameter through its `Variable`,
-    if any. Raises KeyError for an unknown `type`.
+    `learning_rate`. Bounds of None set no bounds. Transforms and smoothers may be missing. `small` names
+    parameters that are small, whatever their size. Values and gradients belong to the scene's parameters, not to the
+    optimiser's variables. The optimiser moves a parameter through its `Variable`, if any. Raises KeyError for an
+    unknown `type`.
     """
 
     def __init__(
@@ -67,13 +68,15 @@ class Optimizer:
         bounds: Mapping[str, tuple[float, float] | None],
         transforms: Mapping[str, Transform | None] | None = None,
         smoothers: Mapping[str, Smoother] | None = None,
+        small: Collection[str] = (),
     ) -> None:
         self._rates = {key: float(rates[key] or learning_rate) for key in values}
         self._bounds = {key: bounds[key] for key in values}
         named = {"alpha" if name == "decay" else name: value for name, value in options.items()}
-        small = {key: size for key, value in values.items() if (size := np.array(dr.detach(value)).size) <= SMALL}
+        sizes = {key: np.array(dr.detach(value)).size for key, value in values.items()}
+        self._small = {key for key, size in sizes.items() if size <= SMALL or key in small}
         #: Joint steps of small parameters, for `auto`.
-        self.block = Block(small if type == "auto" else {})
+        self.block = Block({key: sizes[key] for key in values if key in self._small} if type == "auto" else {})
         self._own = {
             key: Joint(self.block) if key in self.block.at else OPTIMIZERS[type](lr=self._rates[key], **named)
             for key in values
@@ -278,7 +281,8 @@ class Optimizer:
 
     def is_small(self, key: str) -> bool:
         """Return whether the entries of a parameter are few, so that they are examined one by one."""
-        return bool(dr.prod(dr.shape(self[key])) <= (SMALL_HEIGHTMAP if key in self.extents else SMALL))
+        size = dr.prod(dr.shape(self[key]))
+        return key in self._small or bool(size <= (SMALL_HEIGHTMAP if key in self.extents else SMALL))
 
     def _longest(self, key: str) -> float:
         """Return the longest step of a small parameter, in the unit of the optimiser's variable."""

@@ -337,6 +337,7 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
             for key, spec in specs.items()
             if spec.smoothing is not None
         },
+        small=list(selection.factors),
     )
     optimizer.displace(selection.deformation.extents)
     # Images with an exposure of their own would fix the colours. Steps of `sgd` are short where gradients are small, so
