@@ -8,6 +8,7 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -280,6 +281,8 @@ class Recording:
     def _measure_certainty(self) -> None:
         last = self.course.last
         config = self.problem.config
+        for view in self.problem.views:  # an earlier end of this run may have written maps
+            self._misfit_path(view.sensor).unlink(missing_ok=True)
         if last is None or self.done < LEAST_ITERATIONS or not config.run.certainty:
             return
         if not config.by_pixel:
@@ -295,12 +298,11 @@ class Recording:
         for key, shown in self.course.certainty.shown.items():
             if key not in self.problem.masks:  # `_begin` has written the masks of the problem
                 write_mask(self.folder.parameters, key, shown)
-        for view in self.problem.views:
-            path = self.folder.images / f"{self._image_name('misfit', view.sensor)}.exr"
-            if view.sensor in self.course.certainty.misfits:
-                write_file(path, self.course.certainty.misfits[view.sensor], linear=True)
-            else:
-                path.unlink(missing_ok=True)  # an earlier end of this run may have written it
+        for sensor, shown in self.course.certainty.misfits.items():
+            write_file(self._misfit_path(sensor), shown, linear=True)
+
+    def _misfit_path(self, sensor: int) -> Path:
+        return self.folder.images / f"{self._image_name('misfit', sensor)}.exr"
 
     def _measure_seen_errors(self) -> None:
         self.seen = finite(seen_errors(self.folder.path, self.manifest.views))

@@ -68,7 +68,10 @@ def test_a_loop_ends_with_the_warnings_of_the_run(
     assert said[-len(warnings) :] == warnings
 
 
-def test_the_map_of_a_misfit_is_that_of_the_last_end(experiment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_certain", [True, False])
+def test_the_map_of_a_misfit_is_that_of_the_last_end(
+    experiment: Path, monkeypatch: pytest.MonkeyPatch, is_certain: bool
+) -> None:
     shown = np.full((2, 3, 1), -0.3, np.float32)
 
     def measure(self: measuring.Certainty, iterations: int, *_: object) -> None:
@@ -78,7 +81,7 @@ def test_the_map_of_a_misfit_is_that_of_the_last_end(experiment: Path, monkeypat
     list(rl.optimize("tiny.yaml", "runs/a", overrides={"run.iterations": 20}))
     path = Path("runs/a/images/misfit.exr")
     np.testing.assert_allclose(load_image(path), shown)
-    list(rl.optimize(resume="runs/a", overrides={"run.iterations": 21}))
+    list(rl.optimize(resume="runs/a", overrides={"run.iterations": 21, "run.certainty": is_certain}))
     assert not path.exists()
 
 

@@ -244,6 +244,7 @@ def test_parameters_that_explain_little_are_not_named(monkeypatch: pytest.Monkey
     found = (("a", 5.0, 1e-9), ("b", 0.6, 1e-3), ("c", 0.4, 1e-9), ("d", 9.0, 0.02))
     tested = [(fall, p, fit.Candidate(key, p, 0.0, [1.0], [])) for key, fall, p in found]
     monkeypatch.setattr(candidates, "_find_candidates", lambda *_: tested)
+    monkeypatch.setattr(candidates, "_test_response", lambda *_: [])
     known = types.SimpleNamespace(biases=[])
     record = candidates.judge_fit(None, fit.Fit(0.002, 20.0, 20.0, 20.0, [], [], []), known, lambda: True)
     assert {each.key: each.explained for each in record.candidates} == pytest.approx({"a": 0.5, "b": 0.06})

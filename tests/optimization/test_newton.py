@@ -518,6 +518,46 @@ def test_a_noisy_curvature_does_not_lead_to_long_steps():
     np.testing.assert_allclose(raise_eigenvalues(slopes, slopes, certain)[0], true + certain, rtol=0.02)
 
 
+def along_the_valley(found: np.ndarray, true: np.ndarray) -> float:
+    """Return the curvature along the eigenvector of the smallest eigenvalue of `true` (M, M), if all other directions
+    of `found` follow, in units of that eigenvalue.
+    """
+    values, vectors = np.linalg.eigh(true)
+    valley = np.pad(vectors[:, 0], (0, len(found) - len(true)))
+    return float(1 / (valley @ np.linalg.inv(found) @ valley) / values[0])
+
+
+@pytest.mark.parametrize("noisy", [0, 1, 7])
+def test_directions_of_noise_hide_no_small_eigenvalue(noisy: int):
+    """Three directions are nearly alike. Noise hides the others. Without a reduced coupling, the curvature along the
+    valley was up to 20 times too large.
+    """
+    random = np.random.default_rng(4)
+    common = random.normal(size=4000) * np.exp(random.normal(size=4000))
+    slopes = common * np.ones((3, 1))
+    slopes[1:] += 0.01 * common.std() * random.normal(size=(2, 4000))
+    sizes = np.array([0.1] * 3 + [0.5] * noisy)[:, None]
+    slopes, found = np.vstack([slopes, 0.02 * random.normal(size=(noisy, 4000))]), []
+    for _ in range(40):
+        a, b = (slopes + sizes * random.normal(size=slopes.shape) for _ in range(2))
+        H, error = raise_eigenvalues(a, b, np.zeros((len(a), len(a))))
+        found.append(along_the_valley(H, slopes[:3] @ slopes[:3].T))
+        assert error < 0.01  # that of the valley
+    assert 0.5 < np.median(found) < 2
+    assert np.quantile(found, 0.95) < 4
+
+
+def test_a_rare_bright_sample_couples_no_directions():
+    """One pixel is a hundred times as bright as the noise of the others, in both samples of one direction."""
+    random = np.random.default_rng(5)
+    slopes = random.normal(size=(2, 1000)) * np.array([[1.0], [0.01]])
+    a, b = (slopes + 0.3 * random.normal(size=slopes.shape) for _ in range(2))
+    a[1, 7], b[1, 7], a[0, 7] = 30.0, 9.0, 30.0
+    H, _ = raise_eigenvalues(a, b, np.zeros((2, 2)))
+    assert abs(H[0, 1]) < 0.2 * np.sqrt(H[0, 0] * H[1, 1])
+    assert H[1, 1] >= 270  # its own curvature stays
+
+
 def test_noise_gives_a_combination_without_effect_no_curvature():
     """The sum of four entries has no effect on the image. The curvature of the other combinations stays."""
     random, slopes = np.random.default_rng(3), np.random.default_rng(2).normal(size=(4, 2000))

@@ -487,10 +487,29 @@ def raise_eigenvalues(a: Array, b: Array, certain: Array) -> tuple[Array, float]
     columns of a and b (M, N) are independent samples.
 
     Noise may exceed a small eigenvalue. Steps in its direction would be too long if the result is small, and would stop
-    if it is negative.
+    if it is negative. Noise also couples directions. The products of a direction with others are therefore reduced by
+    the `_share_of_signal` of both. Otherwise, one direction that the images hardly determine would hide small
+    eigenvalues of all others.
     """
-    values, vectors, errors, units = _eigenvalues(a, b, certain)
-    return np.asarray((vectors * np.maximum(values, errors)) @ vectors.T * units), float(errors[0])
+    share, diagonal = _share_of_signal(a, b), np.sum(a * b, axis=1)
+    noise = (1 - share) * np.sqrt(np.square(a * b).sum(axis=1))
+    a, b = np.sqrt(share)[:, None] * a, np.sqrt(share)[:, None] * b
+    values, vectors, errors, units = _eigenvalues(a, b, certain + np.diag((1 - share) * diagonal), noise)
+    raised = np.maximum(values, errors)
+    return np.asarray((vectors * raised) @ vectors.T * units), float(errors[np.argmin(raised)])
+
+
+def _share_of_signal(a: Array, b: Array) -> Array:
+    """Return 1 minus the squared relative noise of the sums of a b, at least 0, for each row (M,).
+
+    Half the square of a - b estimates the variance of the noise of a value. A rare bright sample would have a far too
+    large estimate, but it changes a sum by about its own product at most.
+    """
+    products, squares = a * b, np.square(a - b)
+    variances = np.abs(products) * squares + squares**2 / 12  # normal noise
+    variance = np.minimum(variances, products**2).sum(axis=1)
+    size = np.maximum(products.sum(axis=1), 0.0)
+    return np.asarray(1 - variance / np.maximum(np.maximum(size**2, variance), 1e-300))
 
 
 def lower_eigenvalues(a: Array, b: Array) -> Array:
@@ -499,19 +518,21 @@ def lower_eigenvalues(a: Array, b: Array) -> Array:
     In a direction without an effect on the image, noise makes the eigenvalue positive by chance. The gradients are
     almost 0 along this direction, so its offset would seem to be known.
     """
-    values, vectors, errors, units = _eigenvalues(a, b, np.zeros((len(a), len(a))))
+    values, vectors, errors, units = _eigenvalues(a, b, np.zeros((len(a), len(a))), np.zeros(len(a)))
     return np.asarray((vectors * np.maximum(values - MARGIN * errors, 0.0)) @ vectors.T * units)
 
 
-def _eigenvalues(a: Array, b: Array, certain: Array) -> tuple[Array, Array, Array, Array]:
+def _eigenvalues(a: Array, b: Array, certain: Array, noise: Array) -> tuple[Array, Array, Array, Array]:
     """Return the eigenvalues (M,) of the sum of a bᵀ and `certain` in units in which the diagonal is 1, the
-    eigenvectors (M, M), the standard errors (M,) of the eigenvalues, and the squares (M, M) of the units.
+    eigenvectors (M, M), the standard errors (M,) of the eigenvalues, and the squares (M, M) of the units. `noise` (M,)
+    has standard errors of the diagonal beside those of a bᵀ.
     """
     H = _symmetric(a @ b.T) + certain
-    size = np.maximum(np.diag(H), np.sqrt(np.square(a * b).sum(axis=1)))
+    size = np.maximum(np.diag(H), np.sqrt(np.square(a * b).sum(axis=1)) + noise)
     root = np.sqrt(np.where(size > 0, size, 1.0))[:, None]
     values, vectors = np.linalg.eigh(H / (root @ root.T))
-    errors = np.sqrt(np.square((vectors.T @ (a / root)) * (vectors.T @ (b / root))).sum(axis=1))
+    squares = np.square((vectors.T @ (a / root)) * (vectors.T @ (b / root))).sum(axis=1)
+    errors = np.sqrt(squares + np.square(vectors.T**2 * (noise / root[:, 0] ** 2)).sum(axis=1))
     return values, vectors, errors, root @ root.T
 
 
