@@ -135,8 +135,7 @@ def test_the_order_of_the_end(
 @pytest.mark.parametrize("done", [0, 3])
 def test_initial_images_are_rendered_once(monkeypatch: pytest.MonkeyPatch, done: int) -> None:
     """If the run ends before its first iteration, they are the final ones."""
-    view = SimpleNamespace(sensor=4, exposed_array=lambda image: 2 * image, target=[[[1.0]]])
-    view.shown_array = lambda image: 3 * image  # with the response
+    view = SimpleNamespace(sensor=4, shown_array=lambda image: 2 * image, target=[[[1.0]]])
     made = Pretended(done=done, initial={}, error_maps={}, folder=SimpleNamespace(images=Path("i")))
 
     def render(*given: Any) -> np.ndarray:
@@ -156,7 +155,7 @@ def test_initial_images_are_rendered_once(monkeypatch: pytest.MonkeyPatch, done:
     for name in ("initial", "final"):
         Recording._write_images(made, name)  # type: ignore[arg-type]
     again = [] if done == 0 else [rendered]
-    assert made.seen == [rendered, "write initial 4 3.0", "see initial", *again, "write final 4 3.0", "see final"]
+    assert made.seen == [rendered, "write initial 4 2.0", "see initial", *again, "write final 4 2.0", "see final"]
     assert (list(made.initial), made.error_maps) == ([4] if done == 0 else [], {"error-4": "i 2.0 1.0 G1.0"})
 
 
