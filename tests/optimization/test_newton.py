@@ -547,6 +547,18 @@ def test_directions_of_noise_hide_no_small_eigenvalue(noisy: int):
     assert np.quantile(found, 0.95) < 4
 
 
+def test_a_rare_bright_sample_does_not_decouple_directions():
+    """Two directions are alike in 1,000 pixels. One pixel of one sample is 60 times as bright. Steps along both would be
+    twice too long without the coupling.
+    """
+    random = np.random.default_rng(6)
+    common = random.choice([-1.0, 1.0], size=1000)
+    a, b = (common + 0.1 * random.normal(size=(2, 1000)) for _ in range(2))
+    a[:, 7] *= 60
+    H, _ = raise_eigenvalues(a, b, np.zeros((2, 2)))
+    assert H[0, 1] > 0.95 * np.sqrt(H[0, 0] * H[1, 1])
+
+
 def test_a_rare_bright_sample_couples_no_directions():
     """One pixel is a hundred times as bright as the noise of the others, in both samples of one direction."""
     random = np.random.default_rng(5)
