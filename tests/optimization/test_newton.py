@@ -548,8 +548,8 @@ def test_directions_of_noise_hide_no_small_eigenvalue(noisy: int):
 
 
 def test_a_rare_bright_sample_does_not_decouple_directions():
-    """Two directions are alike in 1,000 pixels. One pixel of one sample is 60 times as bright. Steps along both would be
-    twice too long without the coupling.
+    """Two directions are alike in 1,000 pixels. One pixel of one sample is 60 times as bright. Without the coupling,
+    steps along both would be twice as long.
     """
     random = np.random.default_rng(6)
     common = random.choice([-1.0, 1.0], size=1000)
