@@ -21,8 +21,8 @@ from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization.assemble import assemble, assemble_scene
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.uncertainty import candidates, fit
+from reslrb_cli.optimization.uncertainty.candidates import may_have_response
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
-from reslrb_cli.optimization.uncertainty.response import may_have_response
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.report.spread import misfit_lines
 from reslrb_cli.runs.prepare import with_freed

@@ -6,6 +6,10 @@ parameters would follow the new one. The part of j that they can also cause is t
 parameter was recovered too, the loss would fall by about s^2 / (2 h). Here h is the curvature that remains. All
 directions of a parameter are tested together.
 
+The response of the camera is tested as one more parameter. The derivatives along the numbers of its curve are -B_k I
+(`optimization/response.py`), so they need no images. All views share the curve, as with
+`target.response: {curve: auto}`.
+
 The noise of s follows from the noise of the residual (`fit.Fit`). Directions that change all channels have the
 noise of channels that are fully correlated.
 """
@@ -18,22 +22,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from reslrb_cli.config.response import MOST
 from reslrb_cli.errors import describe
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
 from reslrb_cli.optimization.uncertainty.fit import LEVEL, Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive, pseudo_inverse
-from reslrb_cli.optimization.uncertainty.response import (
-    may_have_response,
-    response_candidate,
-    response_derivatives,
-)
+from reslrb_cli.optimization.views import RESPONSE
 from reslrb_cli.scene.catalog import open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
 from reslrb_cli.scene.proposal import Proposal, propose, spec_of
+from reslrb_cli.scene.response import basis, start
 from reslrb_cli.statistics import Array, rms, special
 
 logger = logging.getLogger(__name__)
@@ -51,6 +53,8 @@ LEAST_EIGENVALUE = 1e-3
 MOST_MEASURED_AGAIN, MORE, MOST_MULTIPLE, LEAST_SURE = 5, 4, 16, 0.8
 #: Maximum numbers of tested and of recorded parameters.
 MOST_TESTED, MOST_RECORDED = 24, 5
+#: Endings of files that cameras do not write.
+LINEAR_FILES = (".exr", ".hdr", ".pfm")
 
 
 def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]) -> FitRecord:
@@ -124,8 +128,7 @@ def _test(
     """
     if not directions:
         return []
-    slope = curvature.thinned * curvature.in_a_row(fit.slopes)
-    variance = curvature.thinned**2 * curvature.in_a_row(fit.variances)
+    slope, variance = _slope_and_noise(fit, curvature)
     all_channels = max(each.shape[2] for each in fit.slopes)
     channels = np.array([1.0 if each.channel is not None else all_channels for each in directions])
     tests = _Tests(known, curvature.derivatives, curvature.weights, slope, variance, channels)
@@ -144,15 +147,56 @@ def _test_response(problem: Problem, fit: Fit, known: LossCurvature) -> list[tup
     """Return the response of the camera as `_find_candidates` returns parameters, if a curve could be recovered."""
     if not may_have_response(problem):
         return []
-    derivatives = response_derivatives(problem, known)
+    derivatives = _response_derivatives(problem, known)
     places = np.flatnonzero(np.any(derivatives[0], axis=1))
     new = derivatives[0][places], derivatives[1][places]
-    slope, variance = (known.thinned**n * known.in_a_row(each) for n, each in ((1, fit.slopes), (2, fit.variances)))
+    slope, variance = _slope_and_noise(fit, known)
     channels = np.full(len(places), max(each.shape[2] for each in fit.slopes))
     fall, p, offsets = _Tests(known.derivatives, new, known.weights, slope, variance, channels).of(range(len(places)))
     # As many tests as of other parameters, at most.
     p = min(p * (1 + MOST_TESTED), 1.0)
-    return [(min(fall, 0.5 * fit.total), p, response_candidate(places, offsets, p))]
+    return [(min(fall, 0.5 * fit.total), p, _response_candidate(places, offsets, p))]
+
+
+def _slope_and_noise(fit: Fit, curvature: LossCurvature) -> tuple[Array, Array]:
+    """Return dL/dI (N,) and the variance of its noise (N,) at the values of the images that `curvature` has."""
+    return curvature.thinned * curvature.in_a_row(fit.slopes), curvature.thinned**2 * curvature.in_a_row(fit.variances)
+
+
+def may_have_response(problem: Problem) -> bool:
+    """Return whether a curve could be recovered: all targets are files that are decoded as sRGB, and all exposures are
+    recovered.
+    """
+    return problem.config.target.white_balance is None and all(
+        view.file is not None
+        and view.file.suffix.lower() not in LINEAR_FILES
+        and view.exposure.key
+        and view.response is None
+        and (view.decoded_by is None or view.decoded_by.encoding == "srgb")
+        for view in problem.trained
+    )
+
+
+def _response_derivatives(problem: Problem, curvature: LossCurvature) -> tuple[Array, Array]:
+    """Return the derivatives (K, N) of the images along the numbers of a curve, by each set of samples."""
+    parts = [basis("curve", np.array(view.target, dtype=np.float64)) for view in problem.trained]
+    one, other = (
+        np.stack([
+            curvature.in_a_row([-part[k] * image for part, image in zip(parts, images, strict=True)])
+            for k in range(start("curve").size)
+        ])
+        for images in curvature.images
+    )  # fmt: skip
+    return one, other
+
+
+def _response_candidate(places: Array, offsets: Array, p: float) -> Candidate:
+    """Return the record of a curve whose numbers at `places` would change by `offsets`."""
+    value = start("curve")
+    proposed = value.copy()
+    proposed[places] += offsets
+    is_inside = bool(np.all((proposed > 0) & (proposed < MOST)))
+    return Candidate(RESPONSE, p, 0.0, value.tolist(), proposed.tolist() if is_inside else [])
 
 
 def _unrecovered(problem: Problem) -> list[Proposal]:

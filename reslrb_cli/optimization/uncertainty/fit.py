@@ -111,7 +111,8 @@ class Fit:
     """Result of the test of fit. `p` is the probability that noise looks like the residuals. `energy` is twice the loss
     of the misfit, `total` that of the whole residuals, and `size` that of black images. `slopes` are dL/dI of each view
     (H, W, C) at the final values, and `variances` their noise. The variances contain a factor for the noise that
-    neighbouring pixels share, so that all pixels may be taken as independent. `maps` are the misfit maps of each view.
+    neighbouring pixels share, so that all pixels may be taken as independent. `maps` are the misfit maps of
+    all views if the residuals are not noise.
     """
 
     p: float
@@ -160,7 +161,7 @@ def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: 
     residuals = [own + part * change for own, change in zip(left, changes, strict=True)]
     judged, energy, total, size = [], 0.0, 0.0, 0.0
     variances: list[Array] = []
-    maps: list[Array] = []
+    of_residuals: list[Array] = []
     for view, residual, true, weight, of_mean in zip(problem.trained, residuals, trues, weights, of_means, strict=True):
         lattice, correlated = lattice_of(problem, view)
         noise = _noise(of_mean, true)
@@ -173,11 +174,14 @@ def _judge(problem: Problem, curvature: LossCurvature, images: _Images, random: 
         # The variance has the right pattern, and its size is that of most residuals.
         ratios = np.minimum(residual**2 / noise, MOST_RATIO)[residual != 0]
         ratio = float(ratios.mean()) if ratios.size else 0.0
-        variances.append(weight**2 * ratio * noise * correlated)
-        maps.append(misfit_map(residual, ratio * noise * correlated, true, lattice))
+        of_residuals.append(ratio * noise * correlated)
+        variances.append(weight**2 * of_residuals[-1])
     # Any of the views may show the misfit.
     noise = np.max([each.noise for each in judged], axis=0)
     together = Coherence(max(each.surprisal for each in judged), noise, energy)
+    maps = [misfit_map(residual, variance, true, lattice_of(problem, view)[0])
+            for residual, variance, true, view in zip(residuals, of_residuals, trues, problem.trained, strict=True)
+            if together.p <= LEVEL]  # fmt: skip
     return Fit(together.p, min(energy, total), total, size, slopes, variances, maps)
 
 

@@ -182,7 +182,7 @@ class Certainty:
         try:
             go_on = _Budget(seconds, stop)
             fit = measure_fit(self.problem, found.first, _Budget(seconds / 2, stop))
-            self.misfits = {view.sensor: shown for view, shown in zip(self.problem.trained, fit.maps, strict=True)}
+            self.misfits = dict(zip((view.sensor for view in self.problem.trained), fit.maps, strict=False))
             return judge_fit(self.problem, fit, found.first, go_on)
         except Exception as error:
             logger.warning(f"the fit of the model was not tested: {describe(error)}")

@@ -174,8 +174,6 @@ def _error_maps(folder: Path, suffix: str, results: Mapping[str, Any]) -> list[P
         shown.append(show_map(total, signed_end(total), "derivative of the loss", caption, signed=True))
     misfit = load_image(folder / f"misfit{suffix}.exr") if misfit_words(results) else None
     if misfit is not None:
-        caption = lay_out(
-            "titled", "misfit", ", as a share of the target: red is too bright; noise explains what is grey"
-        )
+        caption = lay_out("titled", "misfit", ", as a share of the target: red is too bright, grey is noise")
         shown.append(show_map(misfit, signed_end(misfit), "misfit", caption, signed=True))
     return shown
