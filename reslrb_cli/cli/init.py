@@ -9,10 +9,13 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -22,13 +25,14 @@ from reslrb_cli.cli.options import check_writable
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.loader import loads, parse_override
 from reslrb_cli.config.yaml_text import write
-from reslrb_cli.errors import ConfigError, UnsupportedScene, printable
+from reslrb_cli.errors import ConfigError, UnsupportedScene, describe, printable
 from reslrb_cli.records.atomic import write_atomically, writing
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
     from reslrb_cli.config.schema import Config
+    from reslrb_cli.optimization.first_fit import FirstFit
     from reslrb_cli.scene.images import StoredImage
     from reslrb_cli.scene.proposal import Proposal
     from reslrb_cli.scene.xml.read import Description
@@ -37,6 +41,9 @@ if TYPE_CHECKING:
 #: Pixels of a film with which a run takes minutes on two cores, with these samples and at most these iterations.
 PIXELS = 2**14
 SPP, ITERATIONS = 16, 300
+
+#: Time of the first fit in seconds.
+FIT_SECONDS = 30.0
 
 #: Maximum number of parameters in comments; a scene can have thousands.
 _MOST_OTHERS = 60
@@ -58,13 +65,15 @@ def _first_config(
     sensor: int,
     proposals: Sequence[Proposal],
     movable: Sequence[tuple[str, float, str, str]],
+    explained: Mapping[str, float],
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
 
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
-    ids, shares, file names and free motions of the shapes in view that can be moved. `known` are other template values.
+    ids, shares, file names and free motions of the shapes in view that can be moved. `explained` has the shares of the
+    misfit that parameters explain (`first_fit.FirstFit`). `known` are other template values.
     """
     first = [proposal for proposal in proposals if proposal.first]
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
@@ -72,7 +81,12 @@ def _first_config(
     named = [f"{number} is {_word(name)}" for number, name in enumerate(sensors[:_MOST_SENSORS])]
     return fill(
         "first_config.yaml.j2",
-        {"path": partial(_path, folder=path.absolute().parent), "comment": _comment, "entry": _entry, "note": _note},
+        {
+            "path": partial(_path, folder=path.absolute().parent),
+            "comment": _comment,
+            "entry": _entry,
+            "note": partial(_note, explained=explained),
+        },
         **known,
         file=path.name,
         given=", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in options.items()),
@@ -105,13 +119,15 @@ def _entry(proposal: Proposal) -> str:
     return "{" + ", ".join(parts) + "}"
 
 
-def _note(proposal: Proposal) -> str:
+def _note(proposal: Proposal, explained: Mapping[str, float] = MappingProxyType({})) -> str:
     info, value = proposal.info, proposal.info.value
     parts = [f"{100 * proposal.share:.0f} % of the picture" if proposal.share >= 0.005 else "not seen itself"]
     parts += [f"{info.shape[1]}x{info.shape[0]} texels"] if len(info.shape) == 3 else []
     if value is not None:
         numbers = None if value.numbers is None else " ".join(f"{number:.3g}" for number in value.numbers)
         parts.append(f"{value.low:.3g} to {value.high:.3g}" if numbers is None else f"now {numbers}")
+    if info.key in explained:
+        parts.append(f"explains {100 * explained[info.key]:.0f} % of what the colours do not")
     return ", ".join(parts if info.remark is None else [*parts, info.remark])
 
 
@@ -164,12 +180,22 @@ _RATIO = 0.01
     help="Value of a $NAME of the scene file (scene.options.NAME), or the variant; also written to the configuration. "
     "May be repeated.",
 )
+@click.option(
+    "--fit",
+    "seconds",
+    metavar="SECONDS",
+    type=click.FloatRange(min=0),
+    default=FIT_SECONDS,
+    show_default=True,
+    help="Time for a first fit of the photograph, which decides whether roughnesses are recovered. 0 makes none.",
+)
 def command(
     scene_file: Path,
     target: Path | None,
     output: Path | None,
     index: int,
     overrides: tuple[str, ...],
+    seconds: float,
 ) -> None:
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
@@ -179,9 +205,11 @@ def command(
     as comments with bounds and current values. Remove the # of those that you want. Shapes in view that can be moved
     are listed, too.
 
-    With --target, the film gets the photograph's aspect ratio. The film's size is such that a run takes minutes. If the
-    photograph has another size than the film, the command writes a resized copy beside the configuration. If there are
-    several sensors, the first one is used, unless --sensor names another.
+    With --target, the command first fits the photograph with few samples. If the colours do not explain the
+    photograph, and the roughnesses of the materials do, the configuration recovers the roughnesses, too. The film gets
+    the photograph's aspect ratio. The film's size is such that a run takes minutes. If the photograph has another size
+    than the film, the command writes a resized copy beside the configuration. If there are several sensors, the first
+    one is used, unless --sensor names another.
     """
     from reslrb_cli.backend.variant import set_variant
 
@@ -197,9 +225,11 @@ def command(
     options = given.scene.options
     set_variant(given.variant)
 
+    from reslrb_cli.optimization.first_fit import has_candidates
     from reslrb_cli.optimization.views import own_channels
     from reslrb_cli.scene.images import photo_lines, read_stored
     from reslrb_cli.scene.load import load_scene
+    from reslrb_cli.scene.needs import paths_obstacle
     from reslrb_cli.scene.parameters import select_parameters
     from reslrb_cli.scene.proposal import find_movable_in_view, propose, write_smaller
     from reslrb_cli.scene.response import LINEAR
@@ -228,12 +258,21 @@ def command(
         image = path.with_name(f"{photo.path.stem}-{size[0]}x{size[1]}{'.png' if is_integer else '.exr'}")
         copied = not _has_copy(image, photo, size, is_raw)
     depth, missing = find_depth(scene, index)
-    text = _first_config(
-        path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
-        scene=scene_file, target=image,
-        variant=given.variant, is_raw=is_raw, is_integer=is_integer, size=size, film=own, reason=reason,
-        hides_emitters=description.hides_emitters, depth=depth, missing=missing,
-    )  # fmt: skip
+
+    def write_config(path: Path, image: Path | None, size: Size, proposals: Sequence[Proposal],
+                     explained: Mapping[str, float] = MappingProxyType({})) -> str:  # fmt: skip
+        return _first_config(
+            path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
+            explained, scene=scene_file, target=image,
+            variant=given.variant, is_raw=is_raw, is_integer=is_integer, size=size, film=own, reason=reason,
+            hides_emitters=description.hides_emitters, depth=depth, missing=missing,
+        )  # fmt: skip
+
+    explained: Mapping[str, float] = {}
+    has_camera = paths_obstacle(scene, sensor, "camera") is None
+    if photo is not None and seconds > 0 and has_candidates(scene, proposals):
+        proposals, explained = _with_fit(photo, size, is_raw, proposals, write_config, seconds, has_camera)
+    text = write_config(path, image, size, proposals, explained)
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written
@@ -249,6 +288,49 @@ def command(
     if description.hides_emitters and target is not None:
         echo(f"integrator.hide_emitters: the scene hides lamps and background; set it if {target} does not show them")
     echo(f"next: check it, then run `reslrb optimize {path}`" + ("" if target is not None else " with a target"))
+
+
+def _with_fit(
+    photo: StoredImage, size: Size, is_raw: bool, proposals: Sequence[Proposal], write_config: Callable[..., str],
+    seconds: float, has_camera: bool,
+) -> tuple[list[Proposal], Mapping[str, float]]:  # fmt: skip
+    """Fit the photograph. Return the proposals with those that it asks for among the first ones, and
+    the share of the misfit that each parameter explains.
+
+    An error does not lose the configuration: nothing is added then.
+    """
+    from reslrb_cli.optimization.first_fit import assemble_first_fit, try_out
+    from reslrb_cli.optimization.uncertainty.measuring import Budget
+    from reslrb_cli.scene.proposal import write_smaller
+
+    began = time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory(prefix="reslrb-") as folder:
+            image = Path(folder) / ("photo.png" if photo.white is not None else "photo.exr")
+            write_smaller(photo, size, image, is_raw)
+            path = Path(folder) / "fit.yaml"
+            config = loads(write_config(path, image, size, proposals), path)
+            found = try_out(assemble_first_fit(config, size, has_camera), proposals, Budget(seconds, lambda: False))
+            freed = [replace(each, first=each.first or each.info.key in found.freed) for each in proposals]
+            if found.freed:  # raises an error if an exposure makes up for all of them
+                assemble_first_fit(loads(write_config(path, image, size, freed), path), size, has_camera, to_run=True)
+    except Exception as error:
+        echo(f"the photograph was not fitted: {describe(error)}")
+        return list(proposals), {}
+    echo(f"first fit, {time.perf_counter() - began:.0f} s: {_found_words(found)}")
+    return freed, found.explained
+
+
+def _found_words(found: FirstFit) -> str:
+    """Return what the first fit has found."""
+    if found.misfit is None:
+        return "not finished; --fit gives it more time"
+    if found.misfit == 0:
+        return "the colours explain the photograph"
+    left = f"the colours leave a misfit of {100 * found.misfit:.2g} %"
+    if found.freed:
+        return f"{left}, so these are recovered too: {', '.join(printable(key) for key in found.freed)}"
+    return f"{left}, which no roughness explains"
 
 
 def choose_size(film: Size, photo: StoredImage | None, fixed: bool = False) -> Size:

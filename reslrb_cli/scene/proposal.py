@@ -83,6 +83,8 @@ def _means(image: Image, size: tuple[int, int]) -> Image:
 #: A rough surface without a diffuse lobe shows its material's colour; users do not choose its specular factor of 1 as a
 #: colour.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
+#: Roughness of a material.
+ROUGHNESS = re.compile(r"\b(alpha\w*|\w*roughness)(\.value)?$")
 #: Parameter that a visible lamp shows directly.
 _RADIANCE = re.compile(r"\bradiance\.value$")
 

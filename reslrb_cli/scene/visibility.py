@@ -69,8 +69,22 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor, partly: bool = False) -> n
     With `partly`, surfaces that also have other lobes count as well (coats, blends, thin panes). Light tracing lacks a
     part of the light of these surfaces.
 
-    The function traces CELLS^2 primary rays per pixel through see-through surfaces, the same rays at every call. It may
-    miss objects smaller than a cell.
+    The function may miss objects smaller than a cell (`_sees`).
+    """
+    return _sees(sensor, partial(_meets_specular, scene, partly=partly))
+
+
+def sees_materials(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Sequence[mi.BSDF]) -> np.ndarray:
+    """Return the pixels, boolean (H, W) of a sensor's crop window, whose reconstruction filter reaches surfaces with
+    one of the `bsdfs`. The function may miss objects smaller than a cell (`_sees`).
+    """
+    return _sees(sensor, partial(_meets_materials, scene, bsdfs=bsdfs))
+
+
+def _sees(sensor: mi.Sensor, meets: Callable[[mi.Ray3f, int], mi.Bool]) -> np.ndarray:
+    """Return the pixels, boolean (H, W), whose reconstruction filter reaches a ray for which `meets` is true.
+
+    The function traces CELLS^2 primary rays per pixel, the same rays at every call.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
@@ -85,7 +99,7 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor, partly: bool = False) -> n
         u = (corner + (mi.Point2f(column, row) + jitter) / CELLS) / mi.Vector2f(width, height)
         aperture = mi.Point2f(random.next_float32(), random.next_float32())
         ray, _ = sensor_rays(sensor, sensor.shutter_open(), u, aperture)
-        seen |= _meets_specular(scene, ray, count, partly)
+        seen |= meets(ray, count)
         dr.eval(seen, random)
     return spread(np.array(seen, dtype=bool).reshape(height, width), sensor)
 
@@ -120,6 +134,17 @@ def _meets_specular(scene: mi.Scene, ray: mi.Ray3f, count: int, partly: bool) ->
         flags = si.bsdf().flags()
         specular = reached & si.is_valid() & ((flags & lobes) != 0)
         found |= specular if partly else specular & ((flags & others) == 0)
+        dr.schedule(found)
+    return found
+
+
+def _meets_materials(scene: mi.Scene, ray: mi.Ray3f, count: int, bsdfs: Sequence[mi.BSDF]) -> mi.Bool:
+    """Return whether a surface along a ray, up to the first surface that is not see-through, has one of the `bsdfs`."""
+    found = dr.zeros(mi.Bool, count)
+    for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
+        own = si.bsdf()
+        for bsdf in bsdfs:
+            found |= reached & si.is_valid() & (own == mi.BSDFPtr(bsdf))
         dr.schedule(found)
     return found
 

@@ -6,7 +6,7 @@ and point lamps. The photograph has 8 bits and an unknown exposure.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,7 +120,9 @@ def wood() -> np.ndarray:
     return (np.array([0.45, 0.28, 0.15]) * boards).astype(np.float32)
 
 
-def write_room(folder: Path, room: Room, size: tuple[int, int], spp: int) -> None:
+def write_room(
+    folder: Path, room: Room, size: tuple[int, int], spp: int, material: Callable[..., str] = material
+) -> None:
     """Write `scene.xml`, in which all colours are grey, and `photo.png` of the scene with the true colours."""
     for part in (*PARTS, "lamp"):
         write_mesh(folder / f"{part}.ply", quads(part))
@@ -151,6 +153,10 @@ def write_room(folder: Path, room: Room, size: tuple[int, int], spp: int) -> Non
     photo.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(str(folder / "photo.png"))
 
 
+#: Settings that need no measurements.
+QUICK = ("integrator.paths=both", "integrator.guiding=off", "integrator.pixels=even", "run.final_spp=16")
+
+
 def recover(folder: Path, room: Room, *sets: str) -> tuple[dict[str, float], float]:
     """Run the configuration that `init` writes. Return the largest error of each part's colour, and the exposure."""
     tiny.done("init", folder / "scene.xml", "--target", folder / "photo.png", "-o", folder / "room.yaml")
@@ -176,8 +182,7 @@ def test_a_dark_room_beside_an_unknown_exposure_is_recovered(tmp_path: Path) -> 
     fall.
     """
     write_room(tmp_path, ROOMS["dark"], (24, 15), 4096)
-    quick = ("integrator.paths=both", "integrator.guiding=off", "integrator.pixels=even", "run.final_spp=16")
-    errors, exposure = recover(tmp_path, ROOMS["dark"], *quick)
+    errors, exposure = recover(tmp_path, ROOMS["dark"], *QUICK)
     assert len(errors) == len(PARTS)
     assert max(errors.values()) < 0.015, errors
     assert exposure == pytest.approx(0.6, rel=0.03)
@@ -193,6 +198,24 @@ def test_colours_of_rooms_from_blender_are_recovered(tmp_path: Path, name: str) 
     assert len(errors) >= len(PARTS) - 1
     assert max(errors.values()) < 0.03, errors
     assert exposure == pytest.approx(ROOMS[name].exposure, rel=0.03)
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_colours_of_rooms_with_unknown_roughnesses_are_recovered(tmp_path: Path, name: str) -> None:
+    """The file has the roughness 0.5 everywhere. The true ones are random."""
+    random = np.random.default_rng(1)
+    roughnesses = dict(zip(PARTS, random.choice([0.2, 0.35, 0.5, 0.7, 0.9], len(PARTS)), strict=True))
+
+    def own(part: str, colour: Colour | str, roughness: float, is_true: bool) -> str:
+        return material(part, colour, roughnesses[part] if is_true else 0.5, is_true)
+
+    write_room(tmp_path, ROOMS[name], (48, 30), 1024, own)
+    errors, exposure = recover(tmp_path, ROOMS[name], *QUICK)
+    off = abs(exposure / ROOMS[name].exposure - 1)
+    print(f"{name}: largest colour error {max(errors.values()):.3f}, exposure {off:.1%} off")
+    assert len(errors) >= len(PARTS) - 1
+    assert max(errors.values()) < 0.05, errors
+    assert off < 0.03
 
 
 #: Surfaces of a closed box: the steps that place a square of side 2.

@@ -250,6 +250,18 @@ def test_parameters_that_explain_little_are_not_named(monkeypatch: pytest.Monkey
     assert {each.key: each.explained for each in record.candidates} == pytest.approx({"a": 0.5, "b": 0.06})
 
 
+def test_an_error_in_one_test_does_not_lose_the_other_parameters(monkeypatch: pytest.MonkeyPatch, caplog):
+    def fails(*_: Any) -> None:
+        raise ValueError("no images")
+
+    monkeypatch.setattr(candidates, "_find_candidates", lambda *_: [(5.0, 1e-9, fit.Candidate("a", 0, 0, [1.0], []))])
+    monkeypatch.setattr(candidates, "_test_response", fails)
+    known = types.SimpleNamespace(biases=[])
+    record = candidates.judge_fit(None, fit.Fit(0.002, 20.0, 20.0, 20.0, [], [], []), known, lambda: True)
+    assert [each.key for each in record.candidates] == ["a"]
+    assert "no images" in caplog.text
+
+
 def test_noise_shows_no_further_parameter():
     found = [linear(np.random.default_rng([5, number]), 3, 0.0)[0].of([0])[1] for number in range(IMAGES)]
     assert 0.35 < np.mean(found) < 0.65

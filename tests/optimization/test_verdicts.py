@@ -413,10 +413,10 @@ def test_curvature_is_averaged_over_entries_with_similar_steps():
     assert few.mean_of_target(np.arange(3)) == pytest.approx(1 + np.std([-2, 1, 4]) / np.sqrt(3))
 
 
-@pytest.mark.parametrize("correlated", [False, True])
-def test_a_tiny_texture_is_settled_if_its_texels_are_within_the_tolerance_on_average(correlated):
+@pytest.mark.parametrize(("correlated", "is_map"), [(False, True), (True, True), (False, False)])
+def test_a_tiny_texture_is_settled_if_its_texels_are_within_the_tolerance_on_average(correlated, is_map):
     """The error of each texel is 0.03 on average, so single texels may exceed the tolerance of 0.05. Errors in the
-    brightness of the whole texture do not average out.
+    brightness of the whole texture do not average out. The entries of other parameters have verdicts of their own.
     """
     random, size, count, verdicts, spreads = np.random.default_rng(4), 16, 44, [], []
     covariance = 0.03**2 * (0.99 * np.ones((size, size)) + 0.01 * np.eye(size) if correlated else np.eye(size))
@@ -426,11 +426,15 @@ def test_a_tiny_texture_is_settled_if_its_texels_are_within_the_tolerance_on_ave
     for _ in range(20):
         gradients = random.normal(size=(count, size)) @ noise.T
         last = np.stack([gradients[4:], np.tile(value, (count - 4, 1))], axis=1)
-        own = Measured(value, (0.0, 1.0), 0.5, gradients[:4], np.full(size, 1e-3), True, value - 0.1, last)
+        own = Measured(value, (0.0, 1.0), 0.5, gradients[:4], np.full(size, 1e-3), True, value - 0.1, last,
+                       is_map=is_map)  # fmt: skip
         found = weigh({"t": own}, places, H, np.zeros_like(H), {})["t"]
         verdicts.append(found.verdict)
-        spreads.append(found.spread[0])
+        spreads.append(np.mean([spread for spread in found.spread if spread is not None]))
+        assert len(found.spread) == (1 if is_map else size)
     assert 0.02 < np.mean(spreads) < 0.08
+    if not is_map:
+        return
     assert verdicts.count("settled") >= 16 or correlated, verdicts
     assert verdicts.count("settled") <= 1 or not correlated, verdicts
 

@@ -26,7 +26,12 @@ from reslrb_cli.config.response import MOST
 from reslrb_cli.errors import describe
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem, make_optimizer
-from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterDirection, plan_changes
+from reslrb_cli.optimization.uncertainty.curvature import (
+    LossCurvature,
+    ParameterChange,
+    ParameterDirection,
+    plan_changes,
+)
 from reslrb_cli.optimization.uncertainty.fit import LEVEL, Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive, pseudo_inverse
 from reslrb_cli.optimization.views import RESPONSE
@@ -64,13 +69,12 @@ def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[
     """
     if fit.p > LEVEL:
         return FitRecord(fit.p, 0.0, 0.0, False, [])
-    try:
-        found = (
-            [] if known.biases else _find_candidates(problem, fit, known, go_on) + _test_response(problem, fit, known)
-        )
-    except Exception as error:
-        logger.warning(f"no parameters were tested that would reduce the misfit: {describe(error)}")
-        found = []
+    found: list[tuple[float, float, Candidate]] = []
+    for find in () if known.biases else (_find_candidates, _test_response):
+        try:
+            found += find(problem, fit, known, go_on)
+        except Exception as error:
+            logger.warning(f"not all parameters were tested that would reduce the misfit: {describe(error)}")
     named = sorted((each for each in found if each[1] <= LEVEL_OF_NAMED), key=lambda each: -each[0])
     energy = max(fit.energy, *(2 * fall for fall, *_ in named), 0.0)
     candidates = [replace(each, explained=min(2 * fall / max(energy, 1e-300), 1.0)) for fall, _, each in named]
@@ -84,14 +88,11 @@ def _find_candidates(
 ) -> list[tuple[float, float, Candidate]]:
     """Return the further parameters, each after the fall of the loss and its `p`. Significant ones come first."""
     proposals = {each.info.key: each for each in _unrecovered(problem)}
-    specs = [spec_of(key, each.bounds) for key, each in proposals.items()]
-    if not specs:
+    if not proposals:
         return []
-    selection = select_parameters(problem.scene, specs, problem.config.source)
-    others = replace(problem, selection=selection, optimizer=make_optimizer(problem.config, selection), regularizers={})
+    others = _recovering(problem, proposals)
     before = others.values()
-    scales = {key: scale_of(others, proposals[key]) for key in selection.keys}
-    changes, most = plan_changes(others, scales, STEP), MOST_MULTIPLE * problem.config.run.spp
+    changes, most = _changes(others), MOST_MULTIPLE * problem.config.run.spp
     found: list[tuple[float, float, Candidate]] = []
     try:
         count, round, spp = 0, 0, known.spp
@@ -110,8 +111,50 @@ def _find_candidates(
             spp, round = min(spp * MORE, most), round + 1
             changes = [change for change in changes if named & set(change.values)]
     finally:
-        selection.set_arrays(before)
+        others.selection.set_arrays(before)
     return found
+
+
+def measure_together(
+    problem: Problem, fit: Fit, known: LossCurvature, proposals: Mapping[str, Proposal], go_on: Callable[[], bool]
+) -> tuple[float, float]:
+    """Return the fall of the loss if all `proposals` were recovered too, and the probability that noise causes it. If
+    the time ends first, these are 0 and 1.
+    """
+    others = _recovering(problem, proposals)
+    before = others.values()
+    try:
+        changes, curvature = _changes(others), LossCurvature(others, known.spp, of_target=False)
+        directions, *_ = curvature.along(changes, go_on)
+        if len(directions) < sum(len(change.directions) for change in changes):
+            return 0.0, 1.0
+        fall, p, _ = _tests_of(fit, known.derivatives, curvature, directions).of(range(len(directions)))
+        return min(fall, 0.5 * fit.total), p
+    finally:
+        others.selection.set_arrays(before)
+
+
+def _recovering(problem: Problem, proposals: Mapping[str, Proposal]) -> Problem:
+    """Return the problem of recovering the parameters `proposals` alone."""
+    specs = [spec_of(key, each.bounds) for key, each in proposals.items()]
+    selection = select_parameters(problem.scene, specs, problem.config.source)
+    return replace(problem, selection=selection, optimizer=make_optimizer(problem.config, selection), regularizers={})
+
+
+def _changes(problem: Problem) -> list[ParameterChange]:
+    return plan_changes(problem, {key: scale_of(problem, key) for key in problem.selection.keys}, STEP)
+
+
+def _tests_of(
+    fit: Fit, known: tuple[Array, Array], curvature: LossCurvature, directions: Sequence[ParameterDirection]
+) -> _Tests:
+    """Return the tests of `directions`, which `curvature` has measured. `known` are the derivatives along the recovered
+    directions.
+    """
+    slope, variance = _slope_and_noise(fit, curvature)
+    all_channels = max(each.shape[2] for each in fit.slopes)
+    channels = np.array([1.0 if each.channel is not None else all_channels for each in directions])
+    return _Tests(known, curvature.derivatives, curvature.weights, slope, variance, channels)
 
 
 def _test(
@@ -128,11 +171,7 @@ def _test(
     """
     if not directions:
         return []
-    slope, variance = _slope_and_noise(fit, curvature)
-    all_channels = max(each.shape[2] for each in fit.slopes)
-    channels = np.array([1.0 if each.channel is not None else all_channels for each in directions])
-    tests = _Tests(known, curvature.derivatives, curvature.weights, slope, variance, channels)
-    found = []
+    tests, found = _tests_of(fit, known, curvature, directions), []
     for key in dict.fromkeys(direction.key for direction in directions):
         places = [place for place, direction in enumerate(directions) if direction.key == key]
         fall, p, offset = tests.of(places)
@@ -143,7 +182,9 @@ def _test(
     return sorted(found, key=lambda each: (each[1] > LEVEL_OF_NAMED, -each[0]))
 
 
-def _test_response(problem: Problem, fit: Fit, known: LossCurvature) -> list[tuple[float, float, Candidate]]:
+def _test_response(
+    problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
+) -> list[tuple[float, float, Candidate]]:
     """Return the response of the camera as `_find_candidates` returns parameters, if a curve could be recovered."""
     if not may_have_response(problem):
         return []
@@ -216,9 +257,8 @@ def _unrecovered(problem: Problem) -> list[Proposal]:
     return [each for each in found if each.info.key not in moved][:MOST_TESTED]
 
 
-def scale_of(problem: Problem, proposal: Proposal) -> float:
+def scale_of(problem: Problem, key: str) -> float:
     """Return the scale of a parameter: its value, or half the distance between its bounds, if that is larger."""
-    key = proposal.info.key
     low, high = problem.selection.specs[key].bounds or (0.0, 0.0)
     return max(rms(problem.selection.array(key)), 0.5 * (high - low) if np.isfinite(high - low) else 0.0) or 1.0
 

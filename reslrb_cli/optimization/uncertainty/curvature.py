@@ -231,7 +231,7 @@ class LossCurvature:
 
     def __init__(self, problem: Problem, spp: int, of_target: bool = True, round: int = 0) -> None:
         self.problem, self.spp, self.round = problem, spp, round
-        self._base = self._images()
+        self._base = self.see()
         pairs = zip(problem.trained, *self._base, strict=True)
         self._weights = [second_derivative(view, 0.5 * (a + b)) for view, a, b in pairs]
         values = sum(weight.size for weight in self._weights)
@@ -314,14 +314,14 @@ class LossCurvature:
             found.append(self._two_probes(one, other, FIRST_PRODUCT))
         return found
 
-    def _images(self) -> list[list[Array]]:
+    def see(self) -> list[list[Array]]:
         """Render all views at the current values of the scene, with each set of samples."""
         return [see_images(self.problem, self.spp, -1 - 2 * self.round - half, PURPOSE) for half in (0, 1)]
 
     def _derivatives(self, change: ParameterChange) -> list[list[Array]]:
         """Return the derivative of each view's exposed image (H, W, C) along a change, for each set of samples."""
         self.problem.selection.set_arrays(change.values)
-        pairs = zip(self._images(), self._base, strict=True)
+        pairs = zip(self.see(), self._base, strict=True)
         self.problem.apply()
         return [
             [

@@ -14,6 +14,7 @@ import numpy as np
 from reslrb_cli.errors import describe
 from reslrb_cli.optimization.identifiability import shown_texels
 from reslrb_cli.optimization.nonfinite import fill_gaps
+from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.state import State
@@ -135,7 +136,7 @@ class Certainty:
                     take_gradient(problem)
                 compiled_ms += times.codegen_ms
             gradients = {key: fill_gaps(np.array(samples)) for key, samples in rows.items()}
-            go_on = _Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations, LEAST_SECONDS), stop)
+            go_on = Budget(max(SHARE * elapsed_s, MOST_STEPS * elapsed_s / iterations, LEAST_SECONDS), stop)
             with clock.step() as times:
                 tiny = self._tiny()
                 measured = self._measured(gradients, iterations, tiny)
@@ -180,8 +181,8 @@ class Certainty:
         from reslrb_cli.optimization.uncertainty.candidates import judge_fit  # late, because it imports SciPy
 
         try:
-            go_on = _Budget(seconds, stop)
-            fit = measure_fit(self.problem, found.first, _Budget(seconds / 2, stop))
+            go_on = Budget(seconds, stop)
+            fit = measure_fit(self.problem, found.first, Budget(seconds / 2, stop))
             self.misfits = dict(zip((view.sensor for view in self.problem.trained), fit.maps, strict=False))
             return judge_fit(self.problem, fit, found.first, go_on)
         except Exception as error:
@@ -270,6 +271,7 @@ class Certainty:
                 last=last,
                 rows=own,
                 seen=self._seen_entries(key, rows),
+                is_map=is_small and value.size > SMALL and key not in self.problem.selection.factors,
             )
         return found
 
@@ -316,7 +318,7 @@ class Curvatures:
 
 
 def _measure_curvature(
-    problem: Problem, plan: Sequence[ParameterChange], measured: Mapping[str, Measured], go_on: _Budget
+    problem: Problem, plan: Sequence[ParameterChange], measured: Mapping[str, Measured], go_on: Budget
 ) -> Curvatures:
     """Measure the curvature along the changes of `plan`, and by entry, until `go_on` returns false."""
     run, unit = problem.config.run, problem.samples_per_pass or 1
@@ -396,7 +398,7 @@ def hides(directions: Sequence[ParameterDirection], curvature: Array, sure: Arra
     return bool(np.linalg.eigvalsh(chosen / np.sqrt(np.outer(size, size)))[0] <= 0)
 
 
-class _Budget:
+class Budget:
     """Time for more measurements. A call returns true if time is left and `stop()` is false.
 
     The longest time between two calls does not count, because it is assumed to include a compilation.

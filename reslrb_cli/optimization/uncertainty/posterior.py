@@ -65,6 +65,7 @@ class Measured:
         brightness, and that logarithm (`brightness`).
     - `rows` (n, 2, N) has the gradients and the values of the last n iterations of a small texture, if known.
     - `seen` (N,) marks the entries of a texture that some view shows. `seen` is None for other parameters.
+    - `is_map` is true for a small texture or heightmap, whose entries have one spread.
     """
 
     value: Array
@@ -77,6 +78,7 @@ class Measured:
     last: Array | None = None
     seen: Array | None = None
     rows: Array | None = None
+    is_map: bool = False
 
     @property
     def mean(self) -> Array:

@@ -44,7 +44,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.uncertainty.coupling import Maps, texel_offsets
 from reslrb_cli.optimization.uncertainty.curvature import EntryCurvature, ParameterDirection
 from reslrb_cli.optimization.uncertainty.fit import FitRecord
@@ -371,7 +370,7 @@ def _small(own: Measured, at: Sequence[int], found: Judged) -> ParameterCertaint
     if own.seen is not None:
         verdicts = [v if seen else ParameterVerdict.NOT_SEEN for v, seen in zip(verdicts, own.seen, strict=True)]
     known = [each not in (ParameterVerdict.AT_BOUND, *WITHOUT) for each in verdicts]
-    is_tiny = own.value.size > SMALL and any(known)
+    is_tiny = own.is_map and any(known)
     if is_tiny and _limit_of_all(own, at, found, np.array(known)) <= own.tolerance(rms(own.value[known])):
         verdicts = [ParameterVerdict.SETTLED if each else v for each, v in zip(known, verdicts, strict=True)]
     verdict = summarise(shares(verdicts))

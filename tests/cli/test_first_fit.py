@@ -1,0 +1,108 @@
+"""`init --target` fits the photograph, and recovers roughnesses if the photograph asks for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from cli import corners, tiny
+from kit import area, diffuse, scene, sensor, shape
+
+from reslrb_cli.config.loader import load
+from reslrb_cli.optimization.first_fit import assemble_first_fit, fit_by_differences
+from reslrb_cli.optimization.uncertainty.measuring import Budget
+
+pytestmark = pytest.mark.usefixtures("llvm")
+
+FLOOR, WALL, ALPHA = "floor.bsdf.diffuse_reflectance.value", "wall.bsdf.reflectance.value", "floor.bsdf.alpha"
+SIZE = (24, 16)
+
+
+def write_corner(folder: Path, alpha: float) -> None:
+    """Write `corner.xml`, a grey glossy floor before a wall, and `photo.png`, its picture by `path` with other colours
+    and the roughness `alpha`. The file has the roughness 0.3.
+    """
+    for name, floor, wall, roughness in (
+        ("corner", "0.5", "0.5", 0.3),
+        ("true", "0.5,0.3,0.15", "0.15,0.3,0.6", alpha),
+    ):
+        gloss = (f'<bsdf type="roughplastic"><rgb name="diffuse_reflectance" value="{floor}"/>'
+                 f'<float name="alpha" value="{roughness}"/></bsdf>')  # fmt: skip
+        text = scene(
+            sensor("0, 1, 3", "0, 0.5, 0", size=SIZE, fov=60, rfilter="gaussian"),
+            shape("rectangle", "floor", gloss, place='<rotate x="1" angle="-90"/><scale value="2"/>'),
+            shape("rectangle", "wall", diffuse(wall), place='<scale value="2"/><translate y="1" z="-1.5"/>'),
+            shape("rectangle", "lamp", diffuse("0"), area("20, 18, 15"),
+                  place='<rotate x="1" angle="90"/><scale value="0.4"/><translate y="0.9" z="-1"/>'),
+        )  # fmt: skip
+        (folder / f"{name}.xml").write_text(text)
+    path = mi.load_dict({"type": "path", "max_depth": 8})
+    image = np.array(mi.render(mi.load_file(str(folder / "true.xml")), integrator=path, spp=2048))[:, :, :3]
+    tiny.write_photo(folder / "photo.png", 0.4 * image)
+
+
+@pytest.fixture(autouse=True)
+def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(("alpha", "is_freed"), [(0.3, False), (0.1, True)])
+def test_a_roughness_is_recovered_if_the_colours_do_not_explain_the_photograph(
+    tmp_path: Path, alpha: float, is_freed: bool
+) -> None:
+    write_corner(tmp_path, alpha)
+    done = tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 120)
+    words = "these are recovered too: floor.bsdf.alpha" if is_freed else "the colours explain the photograph"
+    assert words in done.output
+    keys = [key for spec in load(tmp_path / "corner.yaml").parameters for key in spec.keys]
+    assert (ALPHA in keys) == is_freed, done.output
+    assert {FLOOR, WALL} <= set(keys)
+
+
+def test_without_a_first_fit_no_roughness_is_recovered(tmp_path: Path) -> None:
+    write_corner(tmp_path, 0.1)
+    done = tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 0)
+    assert "first fit" not in done.output
+    assert ALPHA not in [key for spec in load(tmp_path / "corner.yaml").parameters for key in spec.keys]
+
+
+def test_a_fit_that_does_not_end_in_time_adds_nothing(tmp_path: Path) -> None:
+    write_corner(tmp_path, 0.1)
+    done = tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 0.01)
+    assert "not finished; --fit gives it more time" in done.output
+    assert ALPHA not in [key for spec in load(tmp_path / "corner.yaml").parameters for key in spec.keys]
+
+
+def test_steps_by_differences_find_colours_beside_an_unknown_exposure(tmp_path: Path) -> None:
+    """Rendered by the model itself, a photograph of 8 bits gives the colours within 0.03 in a few steps."""
+    write_corner(tmp_path, 0.3)
+    tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 0)
+    problem = assemble_first_fit(load(tmp_path / "corner.yaml"), SIZE, has_camera=True)
+    problem, is_done = fit_by_differences(problem, Budget(600, lambda: False))
+    assert is_done
+    found = problem.values()
+    np.testing.assert_allclose(found[FLOOR], [0.5, 0.3, 0.15], atol=0.03)
+    np.testing.assert_allclose(found[WALL], [0.15, 0.3, 0.6], atol=0.03)
+    np.testing.assert_allclose(found["exposure"], 0.4, rtol=0.05)
+
+
+@pytest.mark.long
+def test_rates_of_the_first_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Corners with the right roughnesses, and with wrong ones by a factor of at least 1.35, of which a lamp may show
+    little.
+    """
+    freed = {}
+    for is_right in (True, False):
+        found = []
+        for seed in range(14):
+            (folder := tmp_path / f"{is_right}-{seed}").mkdir()
+            monkeypatch.chdir(folder)
+            corners.write_corner(folder, 100 + seed, (64, 40), is_right)
+            done = tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 120)
+            found.append("recovered too: " in done.output)
+        freed[is_right] = sum(found)
+    print(freed)
+    assert freed[True] <= 1
+    assert freed[False] >= 12
