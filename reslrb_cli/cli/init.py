@@ -51,6 +51,9 @@ _MOST_OTHERS = 60
 #: Maximum number of variables and sensors in a comment, and of characters of a variable.
 _MOST_VARIABLES, _MOST_SENSORS, _LONGEST = 8, 6, 40
 
+#: Maximum number of parameters that the line about the first fit names.
+_MOST_NAMED = 3
+
 #: Width of a comment with several lines.
 _COMMENT = 110
 _NUMBER = re.compile(r"-?\d{1,15}(\.\d{1,15})?")
@@ -311,6 +314,8 @@ def _with_fit(
             path = Path(folder) / "fit.yaml"
             config = loads(write_config(path, image, size, proposals), path)
             found = try_out(assemble_first_fit(config, size, has_camera), proposals, Budget(seconds, lambda: False))
+            if found is None:
+                return list(proposals), {}
             freed = [replace(each, first=each.first or each.info.key in found.freed) for each in proposals]
             if found.freed:  # raises an error if an exposure makes up for all of them
                 assemble_first_fit(loads(write_config(path, image, size, freed), path), size, has_camera, to_run=True)
@@ -329,7 +334,9 @@ def _found_words(found: FirstFit) -> str:
         return "the colours explain the photograph"
     left = f"the colours leave a misfit of {100 * found.misfit:.2g} %"
     if found.freed:
-        return f"{left}, so these are recovered too: {', '.join(printable(key) for key in found.freed)}"
+        named = ", ".join(printable(key) for key in found.freed[:_MOST_NAMED])
+        more = " ..." if len(found.freed) > _MOST_NAMED else ""
+        return f"{left}, so the run also recovers {named}{more}"
     return f"{left}, which no roughness explains"
 
 

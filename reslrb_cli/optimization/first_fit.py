@@ -86,14 +86,15 @@ def assemble_first_fit(config: Config, size: tuple[int, int], has_camera: bool, 
     return assemble(changed(config, [f"run.spp={spp}", *(f"integrator.{each}" for each in settings)]), to_run=to_run)
 
 
-def try_out(problem: Problem, proposals: Sequence[Proposal], go_on: Callable[[], bool]) -> FirstFit:
-    """Fit the parameters of `problem`, and test which of the `proposals` the photograph asks for.
+def try_out(problem: Problem, proposals: Sequence[Proposal], go_on: Callable[[], bool]) -> FirstFit | None:
+    """Fit the parameters of `problem`, and test which of the `proposals` the photograph asks for. Return None if
+    textures fill the photograph.
 
     The parameters are small ones or textures. Only the brightness of a texture's channels is fitted. Pixels that see a
     texture with many texels are left out, because its texels would explain their residuals.
     """
     if not _leave_textures_out(problem):
-        return FirstFit(None)
+        return None
     problem, is_fitted = fit_by_differences(problem, go_on)
     if not is_fitted:
         return FirstFit(None)

@@ -480,8 +480,10 @@ def test_an_advised_crop_is_smaller_than_the_photograph_and_is_accepted():
     ("share", "words"), [(0.0049, "not seen itself"), (0.0051, "1 % of the picture"), (1.0, "100 % of the picture")]
 )
 def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> None:
-    info = SimpleNamespace(value=None, shape=(), remark="a remark")
+    info = SimpleNamespace(key="a.b", value=None, shape=(), remark="a remark")
     assert _note(SimpleNamespace(info=info, share=share)) == f"{words}, a remark"
+    explained = _note(SimpleNamespace(info=info, share=share), {"a.b": 0.236})
+    assert explained == f"{words}, explains 24 % of what the colours do not, a remark"
 
 
 @pytest.mark.parametrize(
@@ -493,7 +495,7 @@ def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> 
     ],
 )
 def test_a_comment_states_the_value(shape: tuple[int, ...], value: Value, words: list[str]) -> None:
-    info = SimpleNamespace(value=value, shape=shape, remark=None)
+    info = SimpleNamespace(key="a.b", value=value, shape=shape, remark=None)
     assert _note(SimpleNamespace(info=info, share=1.0)) == ", ".join(["100 % of the picture", *words])
 
 
