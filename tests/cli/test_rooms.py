@@ -159,12 +159,13 @@ QUICK = ("integrator.paths=both", "integrator.guiding=off", "integrator.pixels=e
 
 def recover(folder: Path, room: Room, *sets: str) -> tuple[dict[str, float], float]:
     """Run the configuration that `init` writes. Return the largest error of each part's colour, and the exposure."""
-    tiny.done("init", folder / "scene.xml", "--target", folder / "photo.png", "-o", folder / "room.yaml")
+    tiny.done("init", folder / "scene.xml", "--target", folder / "photo.png", "-o", folder / "room.yaml", "--fit", 600)
     tiny.done("optimize", folder / "room.yaml", *settings(*sets))
     values = np.load(folder / "runs/room/parameters/parameters.npz")
     errors = {}
     for part, colour in zip(PARTS, room.colours, strict=True):
-        [value] = [values[key] for key in values.files if key.startswith(f"mat-{part}.")] or [None]
+        keys = [key for key in values.files if key.startswith(f"mat-{part}.") and "base_color" in key]
+        [value] = [values[key] for key in keys] or [None]
         if value is None or colour == METAL:
             continue
         off = value[SHOWN] - wood()[SHOWN] if colour == WOOD else value - colour
