@@ -68,7 +68,7 @@ def _first_config(
     sensor: int,
     proposals: Sequence[Proposal],
     movable: Sequence[tuple[str, float, str, str]],
-    explained: Mapping[str, float],
+    explained: Mapping[str, float] = MappingProxyType({}),
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
