@@ -201,7 +201,7 @@ def test_colours_of_rooms_from_blender_are_recovered(tmp_path: Path, name: str) 
     assert exposure == pytest.approx(ROOMS[name].exposure, rel=0.03)
 
 
-#: Exposures that end more than 3 % off: the pictures of 48x30 pixels hardly tell an exposure from colours and roughnesses.
+#: Exposures that end more than 3 % off. Pictures of 48x30 pixels hardly tell an exposure from colours and roughnesses.
 OFF = {"sofa": 0.1, "dark": 0.1, "bright": 0.1}
 TEXTURE = pytest.mark.xfail(
     reason="the first fit leaves out pixels that see the textured floor, and frees no roughness"
