@@ -11,6 +11,7 @@ from cli import corners, tiny
 from kit import area, diffuse, scene, sensor, shape
 
 from reslrb_cli.config.loader import load
+from reslrb_cli.optimization import first_fit
 from reslrb_cli.optimization.first_fit import assemble_first_fit, fit_by_differences
 from reslrb_cli.optimization.uncertainty.measuring import Budget
 
@@ -75,13 +76,19 @@ def test_a_fit_that_does_not_end_in_time_adds_nothing(tmp_path: Path) -> None:
     assert ALPHA not in [key for spec in load(tmp_path / "corner.yaml").parameters for key in spec.keys]
 
 
-def test_steps_by_differences_find_colours_beside_an_unknown_exposure(tmp_path: Path) -> None:
+def test_steps_by_differences_find_colours_beside_an_unknown_exposure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Rendered by the model itself, a photograph of 8 bits gives the colours within 0.03 in a few steps."""
+    moved = first_fit._moved
     write_corner(tmp_path, 0.3)
     tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 0)
     problem = assemble_first_fit(load(tmp_path / "corner.yaml"), SIZE, has_camera=True)
+    tries: list[float] = []
+    monkeypatch.setattr(first_fit, "_moved", lambda *args: tries.append(args[-1]) or moved(*args))
     problem, is_done = fit_by_differences(problem, Budget(600, lambda: False))
     assert is_done
+    assert len(tries) <= 7, tries  # refused steps would be further ones
     found = problem.values()
     np.testing.assert_allclose(found[FLOOR], [0.5, 0.3, 0.15], atol=0.03)
     np.testing.assert_allclose(found[WALL], [0.15, 0.3, 0.6], atol=0.03)

@@ -23,6 +23,7 @@ from reslrb_cli.optimization.sensitivity import sample_gradient, take_gradient
 from reslrb_cli.optimization.uncertainty import candidates, fit
 from reslrb_cli.optimization.uncertainty.candidates import may_have_response
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, plan_changes
+from reslrb_cli.optimization.uncertainty.measuring import Certainty
 from reslrb_cli.optimization.views import set_targets, target_arrays
 from reslrb_cli.report.spread import misfit_lines
 from reslrb_cli.runs.prepare import with_freed
@@ -164,6 +165,16 @@ def test_the_entries_of_a_response_are_judged_one_by_one(folder):
     problem = make(folder, "target.response={curve: auto}")
     assert problem.optimizer.is_small("response")
     assert problem.optimizer.block.at["response"].stop - problem.optimizer.block.at["response"].start == 6
+
+
+def test_the_numbers_of_a_response_have_spreads_of_their_own(folder):
+    """Only textures and heightmaps of as many entries have one spread."""
+    problem = make(folder, "target.response={curve: auto}")
+    certainty = Certainty(problem)
+    certainty.rates = [1.0]
+    found = certainty._measured({"response": np.ones((3, 6))}, 40, set())
+    assert found["response"].is_small
+    assert not found["response"].is_map
 
 
 def test_contrasts_that_no_pixel_shows_follow_their_neighbours(folder):
