@@ -130,7 +130,7 @@ def _note(proposal: Proposal, explained: Mapping[str, float] = MappingProxyType(
         numbers = None if value.numbers is None else " ".join(f"{number:.3g}" for number in value.numbers)
         parts.append(f"{value.low:.3g} to {value.high:.3g}" if numbers is None else f"now {numbers}")
     if info.key in explained:
-        parts.append(f"explains {100 * explained[info.key]:.0f} % of what the colours do not")
+        parts.append(f"explains {100 * explained[info.key]:.0f} % of the misfit")
     return ", ".join(parts if info.remark is None else [*parts, info.remark])
 
 
@@ -190,7 +190,7 @@ _RATIO = 0.01
     type=click.FloatRange(min=0),
     default=FIT_SECONDS,
     show_default=True,
-    help="Time for a first fit of the photograph, which decides whether roughnesses are recovered. 0 makes none.",
+    help="Time for a first fit of the photograph, which decides whether roughnesses are recovered. 0 skips the fit.",
 )
 def command(
     scene_file: Path,
@@ -262,20 +262,17 @@ def command(
         copied = not _has_copy(image, photo, size, is_raw)
     depth, missing = find_depth(scene, index)
 
-    def write_config(path: Path, image: Path | None, size: Size, proposals: Sequence[Proposal],
-                     explained: Mapping[str, float] = MappingProxyType({})) -> str:  # fmt: skip
-        return _first_config(
-            path, options, description.variables, sensors, index, proposals, find_movable_in_view(scene, index),
-            explained, scene=scene_file, target=image,
-            variant=given.variant, is_raw=is_raw, is_integer=is_integer, size=size, film=own, reason=reason,
-            hides_emitters=description.hides_emitters, depth=depth, missing=missing,
-        )  # fmt: skip
-
+    write_config = partial(
+        _first_config, options=options, variables=description.variables, sensors=sensors, sensor=index,
+        movable=find_movable_in_view(scene, index), scene=scene_file, size=size, film=own,
+        variant=given.variant, is_raw=is_raw, is_integer=is_integer, reason=reason,
+        hides_emitters=description.hides_emitters, depth=depth, missing=missing,
+    )  # fmt: skip
     explained: Mapping[str, float] = {}
     has_camera = paths_obstacle(scene, sensor, "camera") is None
     if photo is not None and seconds > 0 and has_candidates(scene, proposals):
         proposals, explained = _with_fit(photo, size, is_raw, proposals, write_config, seconds, has_camera)
-    text = write_config(path, image, size, proposals, explained)
+    text = write_config(path, target=image, proposals=proposals, explained=explained)
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written
@@ -312,13 +309,15 @@ def _with_fit(
             image = Path(folder) / ("photo.png" if photo.white is not None else "photo.exr")
             write_smaller(photo, size, image, is_raw)
             path = Path(folder) / "fit.yaml"
-            config = loads(write_config(path, image, size, proposals), path)
+            config = loads(write_config(path, target=image, proposals=proposals), path)
             found = try_out(assemble_first_fit(config, size, has_camera), proposals, Budget(seconds, lambda: False))
             if found is None:
                 return list(proposals), {}
             freed = [replace(each, first=each.first or each.info.key in found.freed) for each in proposals]
             if found.freed:  # raises an error if an exposure makes up for all of them
-                assemble_first_fit(loads(write_config(path, image, size, freed), path), size, has_camera, to_run=True)
+                assemble_first_fit(
+                    loads(write_config(path, target=image, proposals=freed), path), size, has_camera, to_run=True
+                )
     except Exception as error:
         echo(f"the photograph was not fitted: {describe(error)}")
         return list(proposals), {}

@@ -34,8 +34,8 @@ from reslrb_cli.optimization.assemble import assemble, set_values
 from reslrb_cli.optimization.nonfinite import finite
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.uncertainty.candidates import judge_fit, measure_together, scale_of
-from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, ParameterChange, plan_changes
+from reslrb_cli.optimization.uncertainty.candidates import changes_of, judge_fit, measure_together
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature
 from reslrb_cli.optimization.uncertainty.fit import LEVEL, measure_fit
 from reslrb_cli.optimization.views import SHARED
 from reslrb_cli.scene.catalog import COLOUR, EMISSION
@@ -52,8 +52,8 @@ MOST_STEPS, MOST_TRIES = 12, 6
 DAMPING, FACTOR = 1e-3, 10.0
 #: Relative decrease of the loss below which the fit ends.
 CONVERGED = 0.03
-#: Largest probability that noise has the effect of roughnesses that are recovered. The test counts no errors of the fit
-#: itself: in rooms with the right roughnesses, it was as small as 6e-4.
+#: Roughnesses are recovered if noise has the same effect with at most this probability. The test ignores errors of the
+#: fit itself: in rooms with the right roughnesses, the probability was as small as 6e-4.
 CERTAIN = 1e-6
 #: Share of the best other parameter's effect that the roughnesses need together.
 AS_GOOD = 0.5
@@ -102,7 +102,7 @@ def try_out(problem: Problem, proposals: Sequence[Proposal], go_on: Callable[[],
     fall, p = 0.0, 1.0
     for more in MORE:
         known = LossCurvature(problem, more * problem.config.run.spp, of_target=False)
-        known.along(_changes(problem), go_on)
+        known.along(changes_of(problem, STEP), go_on)
         if not go_on():
             return FirstFit(None)
         fit = measure_fit(problem, known, go_on)
@@ -112,13 +112,14 @@ def try_out(problem: Problem, proposals: Sequence[Proposal], go_on: Callable[[],
             break
     if p > CERTAIN and fit.p > LEVEL:
         return FirstFit(0.0)
+    # Roughnesses that are certain are a misfit, even if the test of fit does not see it.
     record = judge_fit(problem, replace(fit, p=min(fit.p, p)), known, go_on)
     explained = {each.key: each.explained for each in record.candidates}
     others = {key: share for key, share in explained.items() if key not in rough}
     best = max(others, key=lambda key: others[key], default="")
     if p <= CERTAIN and 2 * fall >= AS_GOOD * others.get(best, 0.0) * record.energy:
         return FirstFit(record.misfit, list(rough), explained)
-    # A lamp is told from the exposure only beside another lamp.
+    # The images distinguish a lamp from the exposure only if there is another lamp.
     is_lamp = bool(EMISSION.search(best)) and len(problem.scene.emitters()) > 1
     return FirstFit(record.misfit, [best] if is_lamp else [], explained)
 
@@ -141,7 +142,7 @@ def fit_by_differences(problem: Problem, go_on: Callable[[], bool]) -> tuple[Pro
     values = {key: np.array(value, dtype=np.float64) for key, value in problem.values().items()}
     damping = DAMPING
     for _ in range(MOST_STEPS):
-        curvature, changes = LossCurvature(problem, problem.config.run.spp, of_target=False), _changes(problem)
+        curvature, changes = LossCurvature(problem, problem.config.run.spp, of_target=False), changes_of(problem, STEP)
         curvature.along(changes, go_on)
         if len(curvature.directions) < sum(len(change.directions) for change in changes):
             return problem, False
@@ -159,10 +160,6 @@ def fit_by_differences(problem: Problem, go_on: Callable[[], bool]) -> tuple[Pro
         if after > (1 - CONVERGED) * before:
             break
     return problem, True
-
-
-def _changes(problem: Problem) -> list[ParameterChange]:
-    return plan_changes(problem, {key: scale_of(problem, key) for key in problem.selection.keys}, STEP)
 
 
 def _residuals(problem: Problem, curvature: LossCurvature, images: Sequence[Sequence[Array]]) -> list[Array]:

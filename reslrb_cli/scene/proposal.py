@@ -84,7 +84,7 @@ def _means(image: Image, size: tuple[int, int]) -> Image:
 #: colour.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
 #: Roughness of a material.
-ROUGHNESS = re.compile(r"\b(alpha\w*|\w*roughness)(\.value)?$")
+ROUGHNESS = re.compile(r"\b(alpha\w*|\w*roughness)(\.(value|data))?$")
 #: Parameter that a visible lamp shows directly.
 _RADIANCE = re.compile(r"\bradiance\.value$")
 
@@ -92,7 +92,7 @@ _RADIANCE = re.compile(r"\bradiance\.value$")
 _BOUNDS = (
     (r"(reflectance|transmittance|base_color|color\d)\.(values?|data)$", "[0, 1]"),
     (r"\b(vertex|face)_\w*$", "[0, 1]"),
-    (r"\b(alpha\w*|\w*roughness)(\.(value|data))?$", "[0.02, 1]"),
+    (ROUGHNESS, "[0.02, 1]"),
     (r"\b(eta|k)\.(values?|data)$", "[0, 10]"),
     (r"\b(eta|nd)$", "[1.01, 3]"),
     (r"\bVd$", "[10, 100]"),

@@ -8,6 +8,8 @@ would compensate for the missing light (`find_depth`).
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import zip_longest
@@ -71,20 +73,22 @@ def sees_specular(scene: mi.Scene, sensor: mi.Sensor, partly: bool = False) -> n
 
     The function may miss objects smaller than a cell (`_sees`).
     """
-    return _sees(sensor, partial(_meets_specular, scene, partly=partly))
+    return _sees(scene, sensor, partial(_is_specular, partly=partly))
 
 
 def sees_materials(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Sequence[mi.BSDF]) -> np.ndarray:
     """Return the pixels, boolean (H, W) of a sensor's crop window, whose reconstruction filter reaches surfaces with
     one of the `bsdfs`. The function may miss objects smaller than a cell (`_sees`).
     """
-    return _sees(sensor, partial(_meets_materials, scene, bsdfs=bsdfs))
+    pointers = [mi.BSDFPtr(bsdf) for bsdf in bsdfs]
+    return _sees(scene, sensor, lambda si: functools.reduce(operator.or_, (si.bsdf() == each for each in pointers)))
 
 
-def _sees(sensor: mi.Sensor, meets: Callable[[mi.Ray3f, int], mi.Bool]) -> np.ndarray:
-    """Return the pixels, boolean (H, W), whose reconstruction filter reaches a ray for which `meets` is true.
+def _sees(scene: mi.Scene, sensor: mi.Sensor, shows: Callable[[mi.SurfaceInteraction3f], mi.Bool]) -> np.ndarray:
+    """Return the pixels, boolean (H, W), whose reconstruction filter reaches a surface for which `shows` is true.
 
-    The function traces CELLS^2 primary rays per pixel, the same rays at every call.
+    The function traces CELLS^2 primary rays per pixel, the same rays at every call. A ray passes through see-through
+    surfaces, and ends at the first other surface.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     count = width * height
@@ -99,7 +103,9 @@ def _sees(sensor: mi.Sensor, meets: Callable[[mi.Ray3f, int], mi.Bool]) -> np.nd
         u = (corner + (mi.Point2f(column, row) + jitter) / CELLS) / mi.Vector2f(width, height)
         aperture = mi.Point2f(random.next_float32(), random.next_float32())
         ray, _ = sensor_rays(sensor, sensor.shutter_open(), u, aperture)
-        seen |= meets(ray, count)
+        for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
+            seen |= reached & si.is_valid() & shows(si)
+            dr.schedule(seen)
         dr.eval(seen, random)
     return spread(np.array(seen, dtype=bool).reshape(height, width), sensor)
 
@@ -123,30 +129,13 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     return spread(cells, sensor)
 
 
-def _meets_specular(scene: mi.Scene, ray: mi.Ray3f, count: int, partly: bool) -> mi.Bool:
-    """Return whether a surface along a ray, up to the first surface that is not see-through, has only delta lobes. With
-    `partly`, return whether a surface has any delta lobe.
-    """
+def _is_specular(si: mi.SurfaceInteraction3f, partly: bool) -> mi.Bool:
+    """Return whether a surface has only delta lobes. With `partly`, return whether it has any delta lobe."""
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)
     others = int(mi.BSDFFlags.Null | mi.BSDFFlags.Smooth)
-    found = dr.zeros(mi.Bool, count)
-    for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
-        flags = si.bsdf().flags()
-        specular = reached & si.is_valid() & ((flags & lobes) != 0)
-        found |= specular if partly else specular & ((flags & others) == 0)
-        dr.schedule(found)
-    return found
-
-
-def _meets_materials(scene: mi.Scene, ray: mi.Ray3f, count: int, bsdfs: Sequence[mi.BSDF]) -> mi.Bool:
-    """Return whether a surface along a ray, up to the first surface that is not see-through, has one of the `bsdfs`."""
-    found = dr.zeros(mi.Bool, count)
-    for si, reached in surfaces_met(scene, ray, dr.full(mi.Bool, True, count)):
-        own = si.bsdf()
-        for bsdf in bsdfs:
-            found |= reached & si.is_valid() & (own == mi.BSDFPtr(bsdf))
-        dr.schedule(found)
-    return found
+    flags = si.bsdf().flags()
+    specular = (flags & lobes) != 0
+    return specular if partly else specular & ((flags & others) == 0)
 
 
 #: Primary rays for each pixel and each texel, and rays of one pass.

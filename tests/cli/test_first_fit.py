@@ -97,9 +97,7 @@ def test_steps_by_differences_find_colours_beside_an_unknown_exposure(
 
 @pytest.mark.long
 def test_rates_of_the_first_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Corners with the right roughnesses, and with wrong ones by a factor of at least 1.35, of which a lamp may show
-    little.
-    """
+    """At most 1 of 14 corners with right roughnesses recovers them, and at least 12 of 14 with wrong ones do."""
     freed = {}
     for is_right in (True, False):
         found = []

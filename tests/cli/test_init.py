@@ -483,7 +483,7 @@ def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> 
     info = SimpleNamespace(key="a.b", value=None, shape=(), remark="a remark")
     assert _note(SimpleNamespace(info=info, share=share)) == f"{words}, a remark"
     explained = _note(SimpleNamespace(info=info, share=share), {"a.b": 0.236})
-    assert explained == f"{words}, explains 24 % of what the colours do not, a remark"
+    assert explained == f"{words}, explains 24 % of the misfit, a remark"
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def _find_candidates(
         return []
     others = _recovering(problem, proposals)
     before = others.values()
-    changes, most = _changes(others), MOST_MULTIPLE * problem.config.run.spp
+    changes, most = changes_of(others, STEP), MOST_MULTIPLE * problem.config.run.spp
     found: list[tuple[float, float, Candidate]] = []
     try:
         count, round, spp = 0, 0, known.spp
@@ -124,7 +124,7 @@ def measure_together(
     others = _recovering(problem, proposals)
     before = others.values()
     try:
-        changes, curvature = _changes(others), LossCurvature(others, known.spp, of_target=False)
+        changes, curvature = changes_of(others, STEP), LossCurvature(others, known.spp, of_target=False)
         directions, *_ = curvature.along(changes, go_on)
         if len(directions) < sum(len(change.directions) for change in changes):
             return 0.0, 1.0
@@ -141,8 +141,9 @@ def _recovering(problem: Problem, proposals: Mapping[str, Proposal]) -> Problem:
     return replace(problem, selection=selection, optimizer=make_optimizer(problem.config, selection), regularizers={})
 
 
-def _changes(problem: Problem) -> list[ParameterChange]:
-    return plan_changes(problem, {key: scale_of(problem, key) for key in problem.selection.keys}, STEP)
+def changes_of(problem: Problem, share: float) -> list[ParameterChange]:
+    """Return the renderings for the directions of all parameters. Steps are `share` of a parameter's scale."""
+    return plan_changes(problem, {key: _scale_of(problem, key) for key in problem.selection.keys}, share)
 
 
 def _tests_of(
@@ -257,7 +258,7 @@ def _unrecovered(problem: Problem) -> list[Proposal]:
     return [each for each in found if each.info.key not in moved][:MOST_TESTED]
 
 
-def scale_of(problem: Problem, key: str) -> float:
+def _scale_of(problem: Problem, key: str) -> float:
     """Return the scale of a parameter: its value, or half the distance between its bounds, if that is larger."""
     low, high = problem.selection.specs[key].bounds or (0.0, 0.0)
     return max(rms(problem.selection.array(key)), 0.5 * (high - low) if np.isfinite(high - low) else 0.0) or 1.0
