@@ -14,6 +14,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import first_fit
 from reslrb_cli.optimization.first_fit import assemble_first_fit, fit_by_differences
 from reslrb_cli.optimization.uncertainty.measuring import Budget
+from reslrb_cli.scene.visibility import sees_materials
 
 pytestmark = pytest.mark.usefixtures("llvm")
 
@@ -93,6 +94,23 @@ def test_steps_by_differences_find_colours_beside_an_unknown_exposure(
     np.testing.assert_allclose(found[FLOOR], [0.5, 0.3, 0.15], atol=0.03)
     np.testing.assert_allclose(found[WALL], [0.15, 0.3, 0.6], atol=0.03)
     np.testing.assert_allclose(found["exposure"], 0.4, rtol=0.05)
+
+
+def test_pixels_that_see_a_material(tmp_path: Path) -> None:
+    """The film's filter widens each mask. The wall is above the floor."""
+    write_corner(tmp_path, 0.3)
+    made = mi.load_file("corner.xml")
+    bsdfs = {each.id(): each.bsdf() for each in made.shapes()}
+    floor, wall, both = (
+        sees_materials(made, made.sensors()[0], [bsdfs[name] for name in names])
+        for names in (["floor"], ["wall"], ["floor", "wall"])
+    )
+    assert floor.shape == (SIZE[1], SIZE[0])
+    assert floor[-1].all()
+    assert not floor[0].any()
+    assert wall[0, 8:16].all()
+    assert not wall[-1].any()
+    np.testing.assert_array_equal(both, floor | wall)
 
 
 @pytest.mark.long
