@@ -32,21 +32,27 @@ from reslrb_cli.scene.images import Photo, photo_lines, read_photo
 from reslrb_cli.scene.needs import scene_needs
 from reslrb_cli.scene.parameters import Selection, set_values
 from reslrb_cli.scene.rays import visible
-from reslrb_cli.scene.response import LINEAR
+from reslrb_cli.scene.response import LINEAR, SRGB
 from reslrb_cli.scene.values import resample
-from reslrb_cli.scene.visibility import interior, sees_specular, spread
+from reslrb_cli.scene.visibility import interior, sees_even_lamps, sees_specular, spread, widened
 from reslrb_cli.transport.film import FINE, responses_of
 
 #: The seed of rendered targets.
 TARGET_SEED = 0
 #: Remarks on views that are shown in full.
 FEW_REMARKS = 2
+#: Light of a decoded file, 1 at white, from which a pixel of a lamp counts as near white. Film curves show a lamp of 10
+#: times middle grey at 0.64 (Reinhard), 0.68 (Hable), 0.72 (AgX, Reinhard with white), 0.80 (Hejl) and 0.90 (ACES).
+NEAR_WHITE = 0.6
+#: Width in pixels of a lamp's edge.
+EDGE = 2
 #: Descriptions of pixels of each kind.
 WORDS = {
     "specular": "show smooth glass or mirrors",
     "border": "are at the film's border",
     "clipped": "are clipped",
     "beside": "are within the film's filter of clipped ones",
+    "lamps": "show lamps near white",
     "alpha": "have alpha 0",
     "nonfinite": "are not finite",
     "file": "have weight 0 in the mask's file",
@@ -72,6 +78,10 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
             # Beside a lamp 45 times as bright as white, the file is half as bright as it should be.
             found.left_out["clipped"] = photo.clipped
             found.left_out["beside"] = spread(photo.clipped, sensor) & ~photo.clipped
+            response = view.decoded_by or SRGB
+            if photo.is_integer and not response.is_linear and response.curve is None:
+                known = found.left_out["clipped"] | found.left_out["beside"]
+                found.left_out["lamps"] = _compressed_lamps(scene, sensor, photo.image) & ~known
         if "alpha" in mask.kinds:
             found.left_out["alpha"] = photo.transparent
         found.left_out["nonfinite"] = photo.nonfinite
@@ -83,6 +93,19 @@ def mask_of(config: Config, view: View, scene: mi.Scene, photo: Photo | None, la
             raise ConfigError(config.source, f"{view.mask_key}.file", str(error)) from None
         found.left_out["file"] = found.weights == 0
     return found
+
+
+def _compressed_lamps(scene: mi.Scene, sensor: mi.Sensor, image: Array) -> Array:
+    """Return the pixels, boolean (H, W), of lamps that a film curve may have compressed below white. `image` (H, W, C)
+    is a file of integers, decoded.
+
+    The edges of a lamp count if the lamp is near white.
+    """
+    bright = image.max(axis=2) >= NEAR_WHITE
+    if not bright.any():
+        return np.zeros_like(bright)
+    lamps = sees_even_lamps(scene, sensor)
+    return lamps & widened(lamps & bright, EDGE)
 
 
 def mask_line(name: str, masked: Masked, weights: Array) -> str | None:

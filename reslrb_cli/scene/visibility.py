@@ -129,6 +129,19 @@ def sees_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
     return spread(cells, sensor)
 
 
+def sees_even_lamps(scene: mi.Scene, sensor: mi.Sensor) -> np.ndarray:
+    """Return the pixels, boolean (H, W) of a sensor's crop window, whose reconstruction filter reaches the lit side of
+    a shape that emits without a texture. The function may miss lamps smaller than a cell (`_sees`).
+    """
+
+    def shows(si: mi.SurfaceInteraction3f) -> mi.Bool:
+        emitter = si.emitter(scene)
+        is_even = ~mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+        return is_even & dr.any(emitter.eval(si) > 0)
+
+    return _sees(scene, sensor, shows)
+
+
 def _is_specular(si: mi.SurfaceInteraction3f, partly: bool) -> mi.Bool:
     """Return whether a surface has only delta lobes. With `partly`, return whether it has any delta lobe."""
     lobes = int(mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission)

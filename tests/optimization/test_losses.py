@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from agreement import compare
-from cli.tiny import KEY, write_experiment
+from cli.tiny import KEY, SCENE, write_experiment
 from optimization.toy import make_problem
 from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
@@ -511,6 +511,45 @@ def test_pixels_mixed_with_clipped_ones_are_excluded(masked_folder):
     assert f"1 are clipped, {len(near) - 1} are within the film's filter of clipped ones, 1 have" in lines[0]
     off = "target.mask={kinds: [specular, alpha]}"
     assert left_out(make_masked(masked_folder, "target.file=photo.png", off)[0]) == [CLEAR]
+
+
+#: A square lamp in front of the plate. In an image of 16x16 pixels, its edges are inside pixels.
+PANEL = """
+    <shape type="rectangle" id="panel">
+        <transform name="to_world"><scale value="0.45"/><translate z="1"/></transform>
+        <emitter type="area"><rgb name="radiance" value="17"/></emitter>
+    </shape>
+</scene>"""
+
+
+@pytest.mark.parametrize(
+    ("level", "sets", "left"),
+    [
+        (250, (), True),
+        (204, (), True),  # 0.604
+        (203, (), False),  # 0.597
+        (250, (NO_BORDER,), True),
+        (250, ("target.mask={kinds: [specular, border, alpha]}",), False),
+        (250, ("target.response={encoding: linear}",), False),
+        (250, ("target.response={curve: auto}", "target.exposure=auto"), True),
+        (250, ("target.response={curve: [1, 1, 1, 1, 2, 4]}",), False),
+        (250, ("target.response={gamma: 2.2}",), True),
+    ],
+)
+def test_a_lamp_that_a_film_curve_compressed_is_excluded(tmp_path, level, sets, left):
+    """A lamp near white has any brightness. Its edges, which are darker in the file, are excluded too; bright pixels
+    beside it are not.
+    """
+    write_experiment(tmp_path, SCENE.replace("</scene>", PANEL))
+    pixels = np.full((8, 8, 3), 60, np.uint8)
+    pixels[3:5, 3:5] = level
+    pixels[0, 0] = 250
+    mi.Bitmap(pixels).write(str(tmp_path / "photo.png"))
+    problem, lines = make_masked(tmp_path, "target.file=photo.png", *sets)
+    found = set(left_out(problem))
+    inside = {(y, x) for y in (3, 4) for x in (3, 4)}
+    assert found == set() if not left else inside <= found <= {(y, x) for y in range(2, 6) for x in range(2, 6)}
+    assert [line.endswith(f"{len(found)} show lamps near white") for line in lines] == ([True] if left else [])
 
 
 def test_a_file_can_show_the_values_of_the_scene(masked_folder):

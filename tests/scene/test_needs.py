@@ -29,6 +29,7 @@ from reslrb_cli.scene.visibility import (
     DEPTHS,
     LOST,
     find_depth,
+    sees_even_lamps,
     sees_lamps,
     sees_specular,
     visible_texels,
@@ -498,6 +499,16 @@ def test_pixels_that_see_lamps(size: int, sensor: dict) -> None:
     near = 2.0 / 4 * 1.1 if sensor else 1.5 / min(size // 2, 128)
     far = ((y < 3 / 8 - 2 * near) | (y > 5 / 8 + 2 * near))[:, None] | ((x < 1 / 2 - near) | (x > 3 / 4 + near))
     assert not found[far].any()
+    # Even lamps are found at each pixel. A sky, the back of a lamp and a lamp with a texture do not count.
+    even = sees_even_lamps(lit, lit.sensors()[0])
+    assert even[inside].all() or sensor
+    assert not even[far].any()
+    screen = mi.load_dict({"type": "bitmap", "data": mi.TensorXf(np.ones((2, 2, 3))), "raw": True})
+    turned = {"lamp": {**lamp, "to_world": place @ T().rotate([0, 1, 0], 180)}}
+    textured = {"lamp": lamp | {"emitter": {"type": "area", "radiance": screen}}}
+    for other in ({"sky": {"type": "constant"}}, turned, textured):
+        seen = mi.load_dict(scene | other, optimize=False)
+        assert not sees_even_lamps(seen, seen.sensors()[0]).any()
     assert found.sum() > (1.5 if sensor else 0.9) * inside.sum()
 
 
