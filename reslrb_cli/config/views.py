@@ -44,7 +44,8 @@ class Mask(Section):
     cannot render; if shapes move, each iteration finds these pixels anew. `border`: pixels within the radius of the
     reconstruction filter from the film's border, where light tracing is darker. `clipped`: pixels of 8- and 16-bit
     files with the largest possible value in any channel, and the pixels that the film's reconstruction filter mixes
-    with them; lamps near white as well, because cameras compress them to values below white. `alpha`: pixels with an alpha of 0."""
+    with them; lamps near white as well, because cameras compress them to values below white. `alpha`: pixels with an
+    alpha of 0."""
 
 
 def _mask(value: Any) -> Any:
