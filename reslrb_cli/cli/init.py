@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from reslrb_cli.config.schema import Config
     from reslrb_cli.optimization.first_fit import FirstFit
+    from reslrb_cli.optimization.problem import Problem
     from reslrb_cli.scene.images import StoredImage
     from reslrb_cli.scene.proposal import Proposal
     from reslrb_cli.scene.xml.read import Description
@@ -69,6 +70,7 @@ def _first_config(
     proposals: Sequence[Proposal],
     movable: Sequence[tuple[str, float, str, str]],
     explained: Mapping[str, float] = MappingProxyType({}),
+    freed: Sequence[str] = (),
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
@@ -76,8 +78,11 @@ def _first_config(
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
     ids, shares, file names and free motions of the shapes in view that can be moved. `explained` has the shares of the
-    misfit that parameters explain (`first_fit.FirstFit`). `known` are other template values.
+    misfit that parameters explain, and `freed` the keys that the photograph asks for (`first_fit.FirstFit`). `known`
+    are other template values.
     """
+    from reslrb_cli.optimization.views import RESPONSE
+
     first = [proposal for proposal in proposals if proposal.first]
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
     listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
@@ -92,6 +97,8 @@ def _first_config(
         },
         **known,
         file=path.name,
+        has_response=RESPONSE in freed,
+        share_of_response=round(100 * explained.get(RESPONSE, 0.0)),
         given=", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in options.items()),
         rest=", ".join([*listed, "..."] if len(listed) < len(others) else listed),
         sensor=sensor,
@@ -268,11 +275,13 @@ def command(
         variant=given.variant, is_raw=is_raw, is_integer=is_integer, reason=reason,
         hides_emitters=description.hides_emitters, depth=depth, missing=missing,
     )  # fmt: skip
-    explained: Mapping[str, float] = {}
+    found = None
     has_camera = paths_obstacle(scene, sensor, "camera") is None
-    if photo is not None and seconds > 0 and has_candidates(scene, proposals):
-        proposals, explained = _with_fit(photo, size, is_raw, proposals, write_config, seconds, has_camera)
-    text = write_config(path, target=image, proposals=proposals, explained=explained)
+    if photo is not None and seconds > 0 and has_candidates(scene, proposals, is_integer and not is_raw):
+        found = _try_out(photo, size, is_raw, proposals, write_config, seconds, has_camera)
+    freed, explained = ([], {}) if found is None else (found.freed, found.explained)
+    proposals = _with_freed(proposals, freed)
+    text = write_config(path, target=image, proposals=proposals, explained=explained, freed=freed)
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written
@@ -290,15 +299,16 @@ def command(
     echo(f"next: check it, then run `reslrb optimize {path}`" + ("" if target is not None else " with a target"))
 
 
-def _with_fit(
+def _with_freed(proposals: Sequence[Proposal], freed: Sequence[str]) -> list[Proposal]:
+    """Return the proposals, with those of the keys `freed` among the first ones."""
+    return [replace(each, first=each.first or each.info.key in freed) for each in proposals]
+
+
+def _try_out(
     photo: StoredImage, size: Size, is_raw: bool, proposals: Sequence[Proposal], write_config: Callable[..., str],
     seconds: float, has_camera: bool,
-) -> tuple[list[Proposal], Mapping[str, float]]:  # fmt: skip
-    """Fit the photograph. Return the proposals with those that it asks for among the first ones, and
-    the share of the misfit that each parameter explains.
-
-    An error does not lose the configuration: nothing is added then.
-    """
+) -> FirstFit | None:  # fmt: skip
+    """Fit the photograph. Return None after an error, which does not lose the configuration."""
     from reslrb_cli.optimization.first_fit import assemble_first_fit, try_out
     from reslrb_cli.optimization.uncertainty.measuring import Budget
     from reslrb_cli.scene.proposal import write_smaller
@@ -309,34 +319,38 @@ def _with_fit(
             image = Path(folder) / ("photo.png" if photo.white is not None else "photo.exr")
             write_smaller(photo, size, image, is_raw)
             path = Path(folder) / "fit.yaml"
-            config = loads(write_config(path, target=image, proposals=proposals), path)
-            found = try_out(assemble_first_fit(config, size, has_camera), proposals, Budget(seconds, lambda: False))
-            if found is None:
-                return list(proposals), {}
-            freed = [replace(each, first=each.first or each.info.key in found.freed) for each in proposals]
-            if found.freed:  # raises an error if an exposure makes up for all of them
-                assemble_first_fit(
-                    loads(write_config(path, target=image, proposals=freed), path), size, has_camera, to_run=True
-                )
+
+            def make(freed: Sequence[str]) -> Problem:
+                text = write_config(path, target=image, proposals=_with_freed(proposals, freed), freed=freed)
+                # Raises an error if an exposure makes up for all that is freed.
+                return assemble_first_fit(loads(text, path), size, has_camera, to_run=bool(freed))
+
+            found = try_out(make, proposals, Budget(seconds, lambda: False))
+            if found is not None and found.freed:
+                make(found.freed)
     except Exception as error:
         echo(f"the photograph was not fitted: {describe(error)}")
-        return list(proposals), {}
-    echo(f"first fit, {time.perf_counter() - began:.0f} s: {_found_words(found)}")
-    return freed, found.explained
+        return None
+    if found is not None:
+        echo(f"first fit, {time.perf_counter() - began:.0f} s: {_found_words(found)}")
+    return found
 
 
 def _found_words(found: FirstFit) -> str:
     """Return what the first fit has found."""
+    from reslrb_cli.optimization.views import RESPONSE
+
     if found.misfit is None:
         return "not finished; --fit gives it more time"
     if found.misfit == 0:
         return "the colours explain the photograph"
     left = f"the colours leave a misfit of {100 * found.misfit:.2g} %"
     if found.freed:
-        named = ", ".join(printable(key) for key in found.freed[:_MOST_NAMED])
+        words = {RESPONSE: "the camera's response"}
+        named = ", ".join(words.get(key, printable(key)) for key in found.freed[:_MOST_NAMED])
         more = " ..." if len(found.freed) > _MOST_NAMED else ""
         return f"{left}, so the run also recovers {named}{more}"
-    return f"{left}, which no roughness explains"
+    return f"{left}, which neither roughnesses nor a camera's response explain"
 
 
 def choose_size(film: Size, photo: StoredImage | None, fixed: bool = False) -> Size:

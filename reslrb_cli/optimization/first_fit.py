@@ -1,8 +1,8 @@
 """First fit of a photograph: which parameters does the photograph ask for, beside the colours?
 
 `init` writes a configuration that recovers the colours of the materials in view. A scene file seldom has the true
-roughnesses, and the colours would make up for wrong ones. `try_out` therefore fits the photograph with few samples, and
-tests whether the colours explain it.
+roughnesses, and a photograph may have a film curve. The colours would make up for both. `try_out` therefore fits the
+photograph with few samples, and tests whether the colours explain it.
 
 The fit takes Gauss-Newton steps (Levenberg 1944) with derivatives from differences of images, so it needs no reverse
 step. An image has two sets of samples, and each product has one factor of either set, so noise does not bias it. All
@@ -14,9 +14,10 @@ steps use the same samples, so the loss is comparable:
 r is the residual, J are the derivatives of the image, and W is d2L/dI2. A step that raises L is tried again with a
 larger d. Entries at a bound do not move outwards.
 
-All roughnesses are then tested together (`candidates.py`). They are recovered if noise would hardly have the same
-effect, and if they explain at least half as much of the misfit as the best other parameter. Several parameters can
-explain one misfit. Exporters write the same default roughness for many materials, so a wrong roughness is likely.
+All roughnesses are then tested together, and so are the numbers of the camera's response (`candidates.py`). The group
+with the larger effect is recovered if noise would hardly have the same effect, and if it explains at least half as much
+of the misfit as the best other parameter. Several parameters can explain one misfit. Exporters write the same default
+roughness for many materials, so a wrong roughness is likely. After a second fit, the other group is tested again.
 """
 
 from __future__ import annotations
@@ -34,10 +35,15 @@ from reslrb_cli.optimization.assemble import assemble, set_values
 from reslrb_cli.optimization.nonfinite import finite
 from reslrb_cli.optimization.optimizers import SMALL
 from reslrb_cli.optimization.problem import Problem
-from reslrb_cli.optimization.uncertainty.candidates import changes_of, judge_fit, measure_together
+from reslrb_cli.optimization.uncertainty.candidates import (
+    changes_of,
+    group_response,
+    judge_fit,
+    measure_together,
+)
 from reslrb_cli.optimization.uncertainty.curvature import LossCurvature
-from reslrb_cli.optimization.uncertainty.fit import LEVEL, measure_fit
-from reslrb_cli.optimization.views import SHARED
+from reslrb_cli.optimization.uncertainty.fit import LEVEL, Fit, measure_fit
+from reslrb_cli.optimization.views import RESPONSE, SHARED
 from reslrb_cli.scene.catalog import COLOUR, EMISSION
 from reslrb_cli.scene.graph import SceneGraph
 from reslrb_cli.scene.proposal import LEAST_SHARE, ROUGHNESS, Proposal
@@ -55,8 +61,12 @@ CONVERGED = 0.03
 #: Roughnesses are recovered if noise has the same effect with at most this probability. The test ignores errors of the
 #: fit itself: in rooms with the right roughnesses, the probability was as small as 6e-4.
 CERTAIN = 1e-6
-#: Share of the best other parameter's effect that the roughnesses need together.
+#: Share of the best other parameter's effect that a group needs.
 AS_GOOD = 0.5
+#: Smallest effect, as a share of the misfit, of a group that is recovered beside another one.
+LEAST_EFFECT = 0.05
+#: Name of the group of roughnesses. The response has its own key.
+ROUGHNESSES = "roughnesses"
 #: Largest logarithm of a factor in one step.
 LONGEST = 0.7
 #: Step of the differences, as a share of a parameter's scale.
@@ -86,48 +96,87 @@ def assemble_first_fit(config: Config, size: tuple[int, int], has_camera: bool, 
     return assemble(changed(config, [f"run.spp={spp}", *(f"integrator.{each}" for each in settings)]), to_run=to_run)
 
 
-def try_out(problem: Problem, proposals: Sequence[Proposal], go_on: Callable[[], bool]) -> FirstFit | None:
-    """Fit the parameters of `problem`, and test which of the `proposals` the photograph asks for. Return None if
-    textures fill the photograph.
+def try_out(
+    make: Callable[[Sequence[str]], Problem], proposals: Sequence[Proposal], go_on: Callable[[], bool]
+) -> FirstFit | None:
+    """Fit a photograph, and test which further parameters it asks for. Return None if textures fill the photograph.
 
-    The parameters are small ones or textures. Only the brightness of a texture's channels is fitted. Pixels that see a
-    texture with many texels are left out, because its texels would explain their residuals.
+    `make` returns the problem of recovering the colours and the parameters with the given keys. The colours are small
+    parameters or textures. Only the brightness of a texture's channels is fitted. Pixels that see a texture with many
+    texels are left out, because its texels would explain their residuals.
     """
+    problem = make([])
     if not _leave_textures_out(problem):
         return None
-    problem, is_fitted = fit_by_differences(problem, go_on)
-    if not is_fitted:
-        return FirstFit(None)
     rough = {each.info.key: each for each in proposals if is_roughness(each)}
-    fall, p = 0.0, 1.0
+    problem, is_fitted = fit_by_differences(problem, go_on)
+    look = _look(problem, rough, go_on) if is_fitted else None
+    if look is None:
+        return FirstFit(None)
+    if not look.effects and look.fit.p > LEVEL:
+        return FirstFit(0.0)
+    # A group that is certain is a misfit, even if the test of fit does not see it.
+    record = judge_fit(problem, replace(look.fit, p=0.0 if look.effects else look.fit.p), look.known, go_on)
+    explained = {each.key: each.explained for each in record.candidates}
+    others = {key: share for key, share in explained.items() if key not in rough and key != RESPONSE}
+    best = max(others, key=lambda key: others[key], default="")
+    least = AS_GOOD * others.get(best, 0.0) * record.energy
+    name = max(look.effects, key=lambda name: look.effects[name], default="")
+    if not name or look.effects[name] < least:
+        # The images distinguish a lamp from the exposure only if there is another lamp.
+        is_lamp = bool(EMISSION.search(best)) and len(problem.scene.emitters()) > 1
+        return FirstFit(record.misfit, [best] if is_lamp else [], explained)
+    keys = {ROUGHNESSES: list(rough), RESPONSE: [RESPONSE]}
+    freed, rest = keys[name], {} if name == ROUGHNESSES else rough
+    # A response and roughnesses explain a part of each other's misfits, so the rest is tested after a second fit.
+    second = set_values(make(freed), problem.values())
+    if _leave_textures_out(second):
+        second, is_fitted = fit_by_differences(second, go_on)
+        again = _look(second, rest, go_on) if is_fitted else None
+        effects = {} if again is None else again.effects
+        for other in [each for each, effect in effects.items() if effect >= LEAST_EFFECT * record.energy]:
+            freed = freed + keys[other]
+    return FirstFit(record.misfit, freed, explained)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Test of fit, and the effects of groups of parameters that noise hardly causes. An effect is twice the fall of
+    the loss. `known` has measured the recovered directions.
+    """
+
+    fit: Fit
+    known: LossCurvature
+    effects: dict[str, float]
+
+
+def _look(problem: Problem, rough: Mapping[str, Proposal], go_on: Callable[[], bool]) -> _Look | None:
+    """Test the roughnesses `rough`, and the response of the camera, at the values of `problem`. Return None if the time
+    ends first.
+    """
     for more in MORE:
         known = LossCurvature(problem, more * problem.config.run.spp, of_target=False)
         known.along(changes_of(problem, STEP), go_on)
         if not go_on():
-            return FirstFit(None)
+            return None
         fit = measure_fit(problem, known, go_on)
-        if rough:
-            fall, p = measure_together(problem, fit, known, rough, go_on)
-        if p <= CERTAIN:
+        response = group_response(problem, fit, known)
+        groups = {RESPONSE: None if response is None else response[0]}
+        groups[ROUGHNESSES] = measure_together(problem, fit, known, rough, go_on) if rough else None
+        tests = {name: group.beside(known.derivatives) for name, group in groups.items() if group is not None}
+        effects = {name: min(2 * fall, fit.total) for name, (fall, p, _) in tests.items() if p <= CERTAIN}
+        if effects:
             break
-    if p > CERTAIN and fit.p > LEVEL:
-        return FirstFit(0.0)
-    # Roughnesses that are certain are a misfit, even if the test of fit does not see it.
-    record = judge_fit(problem, replace(fit, p=min(fit.p, p)), known, go_on)
-    explained = {each.key: each.explained for each in record.candidates}
-    others = {key: share for key, share in explained.items() if key not in rough}
-    best = max(others, key=lambda key: others[key], default="")
-    if p <= CERTAIN and 2 * fall >= AS_GOOD * others.get(best, 0.0) * record.energy:
-        return FirstFit(record.misfit, list(rough), explained)
-    # The images distinguish a lamp from the exposure only if there is another lamp.
-    is_lamp = bool(EMISSION.search(best)) and len(problem.scene.emitters()) > 1
-    return FirstFit(record.misfit, [best] if is_lamp else [], explained)
+    return _Look(fit, known, effects)
 
 
-def has_candidates(scene: mi.Scene, proposals: Sequence[Proposal]) -> bool:
-    """Return whether a first fit may add parameters: roughnesses in view, or lamps beside others."""
+def has_candidates(scene: mi.Scene, proposals: Sequence[Proposal], has_response: bool) -> bool:
+    """Return whether a first fit may add parameters: a response that may be unknown, roughnesses in view, or lamps
+    beside others.
+    """
     has_lamp = any(EMISSION.search(each.info.key) and not each.first for each in proposals)
-    return (has_lamp and len(scene.emitters()) > 1) or any(is_roughness(each) for each in proposals)
+    is_lamp = has_lamp and len(scene.emitters()) > 1
+    return has_response or is_lamp or any(is_roughness(each) for each in proposals)
 
 
 def is_roughness(proposal: Proposal) -> bool:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -115,23 +115,50 @@ def _find_candidates(
     return found
 
 
+@dataclass(frozen=True)
+class Group:
+    """Parameters that are tested together. `derivatives` (K, N) are those of the images along their directions, by each
+    set of samples. `tests` returns the tests of these directions beside directions with other derivatives.
+    """
+
+    derivatives: tuple[Array, Array]
+    tests: Callable[[tuple[Array, Array]], _Tests]
+
+    def beside(self, known: tuple[Array, Array]) -> tuple[float, float, Array]:
+        """Return the fall of the loss, the probability that noise causes it, and the offsets of the directions, if the
+        parameters were recovered beside others. `known` are the derivatives along the directions of the others.
+        """
+        return self.tests(known).of(range(len(self.derivatives[0])))
+
+
 def measure_together(
     problem: Problem, fit: Fit, known: LossCurvature, proposals: Mapping[str, Proposal], go_on: Callable[[], bool]
-) -> tuple[float, float]:
-    """Return the fall of the loss if all `proposals` were recovered too, and the probability that noise causes it. If
-    the time ends first, these are 0 and 1.
-    """
+) -> Group | None:
+    """Return the group of all `proposals`, or None if the time ends first."""
     others = _recovering(problem, proposals)
     before = others.values()
     try:
         changes, curvature = changes_of(others, STEP), LossCurvature(others, known.spp, of_target=False)
         directions, *_ = curvature.along(changes, go_on)
         if len(directions) < sum(len(change.directions) for change in changes):
-            return 0.0, 1.0
-        fall, p, _ = _tests_of(fit, known.derivatives, curvature, directions).of(range(len(directions)))
-        return min(fall, 0.5 * fit.total), p
+            return None
+        return Group(curvature.derivatives, lambda known: _tests_of(fit, known, curvature, directions))
     finally:
         others.selection.set_arrays(before)
+
+
+def group_response(problem: Problem, fit: Fit, known: LossCurvature) -> tuple[Group, Array] | None:
+    """Return the numbers of a response as a group, with their places (K,) in the curve. Return None if no curve could
+    be recovered.
+    """
+    if not may_have_response(problem):
+        return None
+    derivatives = _response_derivatives(problem, known)
+    places = np.flatnonzero(np.any(derivatives[0], axis=1))
+    new = derivatives[0][places], derivatives[1][places]
+    slope, variance = _slope_and_noise(fit, known)
+    channels = np.full(len(places), max(each.shape[2] for each in fit.slopes))
+    return Group(new, lambda others: _Tests(others, new, known.weights, slope, variance, channels)), places
 
 
 def _recovering(problem: Problem, proposals: Mapping[str, Proposal]) -> Problem:
@@ -187,14 +214,11 @@ def _test_response(
     problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
 ) -> list[tuple[float, float, Candidate]]:
     """Return the response of the camera as `_find_candidates` returns parameters, if a curve could be recovered."""
-    if not may_have_response(problem):
+    found = group_response(problem, fit, known)
+    if found is None:
         return []
-    derivatives = _response_derivatives(problem, known)
-    places = np.flatnonzero(np.any(derivatives[0], axis=1))
-    new = derivatives[0][places], derivatives[1][places]
-    slope, variance = _slope_and_noise(fit, known)
-    channels = np.full(len(places), max(each.shape[2] for each in fit.slopes))
-    fall, p, offsets = _Tests(known.derivatives, new, known.weights, slope, variance, channels).of(range(len(places)))
+    group, places = found
+    fall, p, offsets = group.beside(known.derivatives)
     # As many tests as of other parameters, at most.
     p = min(p * (1 + MOST_TESTED), 1.0)
     return [(min(fall, 0.5 * fit.total), p, _response_candidate(places, offsets, p))]
