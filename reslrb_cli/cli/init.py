@@ -197,7 +197,8 @@ _RATIO = 0.01
     type=click.FloatRange(min=0),
     default=FIT_SECONDS,
     show_default=True,
-    help="Time for a first fit of the photograph, which decides whether roughnesses are recovered. 0 skips the fit.",
+    help="Time for a first fit of the photograph, which decides whether roughnesses and the camera's response are "
+    "recovered. 0 skips the fit.",
 )
 def command(
     scene_file: Path,
@@ -216,7 +217,7 @@ def command(
     are listed, too.
 
     With --target, the command first fits the photograph with few samples. If the colours do not explain the
-    photograph, and the roughnesses of the materials do, the configuration recovers the roughnesses, too. The film gets
+    photograph, the configuration also recovers what does: roughnesses, the camera's response, or both. The film gets
     the photograph's aspect ratio. The film's size is such that a run takes minutes. If the photograph has another size
     than the film, the command writes a resized copy beside the configuration. If there are several sensors, the first
     one is used, unless --sensor names another.

@@ -63,7 +63,7 @@ CONVERGED = 0.03
 CERTAIN = 1e-6
 #: Share of the best other parameter's effect that a group needs.
 AS_GOOD = 0.5
-#: Smallest effect, as a share of the misfit, of a group that is recovered beside another one.
+#: Smallest effect of a group that is recovered beside another one, as a share of the residuals' loss.
 LEAST_EFFECT = 0.05
 #: Name of the group of roughnesses. The response has its own key.
 ROUGHNESSES = "roughnesses"
@@ -133,9 +133,9 @@ def try_out(
     if _leave_textures_out(second):
         second, is_fitted = fit_by_differences(second, go_on)
         again = _look(second, rest, go_on) if is_fitted else None
-        effects = {} if again is None else again.effects
-        for other in [each for each, effect in effects.items() if effect >= LEAST_EFFECT * record.energy]:
-            freed = freed + keys[other]
+        if again is not None:
+            least = LEAST_EFFECT * again.fit.total
+            freed = freed + [key for other, effect in again.effects.items() if effect >= least for key in keys[other]]
     return FirstFit(record.misfit, freed, explained)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,9 +14,16 @@ COLOURED, GLOSSY = ("floor", "wall", "left", "ball"), ("floor", "ball")
 BUILT = (0.1, 0.2, 0.3, 0.4)
 
 
-def write_corner(folder: Path, seed: int, size: tuple[int, int], is_right: bool) -> None:
+def write_corner(
+    folder: Path,
+    seed: int,
+    size: tuple[int, int],
+    is_right: bool,
+    curve: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> None:
     """Write `corner.xml`, in which all colours are grey, and `photo.png` with random colours, lamp and exposure. If
-    not `is_right`, the roughnesses in the photograph differ from those in the file by a factor of at least 1.35.
+    not `is_right`, the roughnesses in the photograph differ from those in the file by a factor of at least 1.35. A
+    `curve` makes linear values of a film curve from light.
     """
     random = np.random.default_rng(seed)
     colours = {name: ",".join(f"{each:.3f}" for each in random.uniform(0.08, 0.85, 3)) for name in COLOURED}
@@ -45,4 +53,4 @@ def write_corner(folder: Path, seed: int, size: tuple[int, int], is_right: bool)
         (folder / f"{name}.xml").write_text(scene(*parts))
     path = mi.load_dict({"type": "path", "max_depth": 16})
     image = np.array(mi.render(mi.load_file(str(folder / "true.xml")), integrator=path, spp=2048))[:, :, :3]
-    tiny.write_photo(folder / "photo.png", exposure * image)
+    tiny.write_photo(folder / "photo.png", exposure * image if curve is None else curve(exposure * image))

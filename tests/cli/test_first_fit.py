@@ -14,6 +14,7 @@ from reslrb_cli.config.loader import load
 from reslrb_cli.optimization import first_fit
 from reslrb_cli.optimization.first_fit import assemble_first_fit, fit_by_differences
 from reslrb_cli.optimization.uncertainty.measuring import Budget
+from reslrb_cli.scene.response import decode_srgb
 from reslrb_cli.scene.visibility import sees_materials
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -22,9 +23,15 @@ FLOOR, WALL, ALPHA = "floor.bsdf.diffuse_reflectance.value", "wall.bsdf.reflecta
 SIZE = (24, 16)
 
 
-def write_corner(folder: Path, alpha: float) -> None:
+def filmic(light: np.ndarray) -> np.ndarray:
+    """Return the linear values of a filmic curve (Hejl and Burgess-Dawson 2010)."""
+    x = np.maximum(0, light - 0.004)
+    return decode_srgb(x * (6.2 * x + 0.5) / (x * (6.2 * x + 1.7) + 0.06))
+
+
+def write_corner(folder: Path, alpha: float, is_filmed: bool = False) -> None:
     """Write `corner.xml`, a grey glossy floor before a wall, and `photo.png`, its picture by `path` with other colours
-    and the roughness `alpha`. The file has the roughness 0.3.
+    and the roughness `alpha`. The file has the roughness 0.3. A filmed picture has a film curve.
     """
     for name, floor, wall, roughness in (
         ("corner", "0.5", "0.5", 0.3),
@@ -42,7 +49,7 @@ def write_corner(folder: Path, alpha: float) -> None:
         (folder / f"{name}.xml").write_text(text)
     path = mi.load_dict({"type": "path", "max_depth": 8})
     image = np.array(mi.render(mi.load_file(str(folder / "true.xml")), integrator=path, spp=2048))[:, :, :3]
-    tiny.write_photo(folder / "photo.png", 0.4 * image)
+    tiny.write_photo(folder / "photo.png", filmic(image) if is_filmed else 0.4 * image)
 
 
 @pytest.fixture(autouse=True)
@@ -50,17 +57,28 @@ def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize(("alpha", "is_freed"), [(0.3, False), (0.1, True)])
-def test_a_roughness_is_recovered_if_the_colours_do_not_explain_the_photograph(
-    tmp_path: Path, alpha: float, is_freed: bool
+@pytest.mark.parametrize(
+    ("alpha", "is_filmed", "words"),
+    [
+        (0.3, False, "the colours explain the photograph"),
+        (0.1, False, f"so the run also recovers {ALPHA}"),
+        (0.3, True, "so the run also recovers the camera's response"),
+        (0.1, True, f"so the run also recovers the camera's response, {ALPHA}"),
+    ],
+)
+def test_a_photograph_asks_for_what_the_colours_do_not_explain(
+    tmp_path: Path, alpha: float, is_filmed: bool, words: str
 ) -> None:
-    write_corner(tmp_path, alpha)
+    """A film curve and a wrong roughness each look a little like the other one. Both are told apart."""
+    write_corner(tmp_path, alpha, is_filmed)
     done = tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 120)
-    words = "so the run also recovers floor.bsdf.alpha" if is_freed else "the colours explain the photograph"
-    assert words in done.output
-    keys = [key for spec in load(tmp_path / "corner.yaml").parameters for key in spec.keys]
-    assert (ALPHA in keys) == is_freed, done.output
+    assert f"{words}\n" in done.output
+    config = load(tmp_path / "corner.yaml")
+    keys = [key for spec in config.parameters for key in spec.keys]
     assert {FLOOR, WALL} <= set(keys)
+    assert (ALPHA in keys) == (alpha != 0.3)
+    response = config.target.response
+    assert (response.recovered if response else "") == ("curve" if is_filmed else "")
 
 
 def test_without_a_first_fit_no_roughness_is_recovered(tmp_path: Path) -> None:
@@ -114,18 +132,24 @@ def test_pixels_that_see_a_material(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_rates_of_the_first_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At most 1 of 14 corners with right roughnesses recovers them, and at least 12 of 14 with wrong ones do."""
-    freed = {}
+@pytest.mark.parametrize("is_filmed", [False, True])
+def test_rates_of_the_first_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_filmed: bool) -> None:
+    """At most 1 of 14 corners with right roughnesses recovers them, and at least 12 of 14 with wrong ones do. At most 1
+    of 14 photographs without a film curve recovers a response, and at least 12 of 14 with one do.
+    """
+    found: dict[bool, list[str]] = {}
     for is_right in (True, False):
-        found = []
+        found[is_right] = []
         for seed in range(14):
             (folder := tmp_path / f"{is_right}-{seed}").mkdir()
             monkeypatch.chdir(folder)
-            corners.write_corner(folder, 100 + seed, (64, 40), is_right)
+            corners.write_corner(folder, 100 + seed, (64, 40), is_right, filmic if is_filmed else None)
             done = tiny.done("init", "corner.xml", "--target", "photo.png", "--fit", 120)
-            found.append("so the run also recovers " in done.output)
-        freed[is_right] = sum(found)
-    print(freed)
-    assert freed[True] <= 1
-    assert freed[False] >= 12
+            found[is_right] += [line for line in done.output.splitlines() if line.startswith("first fit")]
+    print("\n".join(line for lines in found.values() for line in lines))
+    rough = {is_right: sum("alpha" in line for line in lines) for is_right, lines in found.items()}
+    assert rough[True] <= 1
+    assert rough[False] >= 12
+    for lines in found.values():
+        filmed = sum("the camera's response" in line and "also recovers" in line for line in lines)
+        assert filmed >= 12 if is_filmed else filmed <= 1

@@ -52,7 +52,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def of_photograph(folder: Path, width: int, height: int) -> tuple[Config, Result]:
-    result = tiny.done("init", "room/scene.xml", "--target", write_noise(folder / "photo.png", width, height))
+    result = tiny.done(
+        "init", "room/scene.xml", "--target", write_noise(folder / "photo.png", width, height), "--fit", 0
+    )
     return load(folder / "room.yaml"), result
 
 
@@ -122,10 +124,10 @@ def test_a_texture_is_recovered_at_first_unless_it_has_a_pattern(folder: Path, i
 
 def test_a_second_call_with_the_same_photograph_uses_the_same_copy(folder: Path) -> None:
     target = write_noise(folder / "photo.png", 300, 300)
-    tiny.done("init", "room/scene.xml", "--target", target)
+    tiny.done("init", "room/scene.xml", "--target", target, "--fit", 0)
     [copy] = folder.glob("photo-*")
     before = copy.stat().st_mtime_ns
-    tiny.done("init", "room/scene.xml", "-o", "other.yaml", "--target", target)
+    tiny.done("init", "room/scene.xml", "-o", "other.yaml", "--target", target, "--fit", 0)
     assert load(folder / "other.yaml").target.file == load(folder / "room.yaml").target.file == copy
     assert copy.stat().st_mtime_ns == before
     copy.write_bytes(copy.read_bytes()[:-1] + b"x")  # another file of this size
@@ -274,7 +276,7 @@ def test_lamps_of_a_clipped_photograph_are_left_out(tmp_path: Path, monkeypatch:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bulb.xml").write_text(BULB.format(plate=METAL.format(0.3), radiance=WRONG))
     photo = write_noise(tmp_path / "photo.png", 24, 24)
-    tiny.done("init", "bulb.xml", "--target", photo)
+    tiny.done("init", "bulb.xml", "--target", photo, "--fit", 0)
     config = load(tmp_path / "bulb.yaml")
     assert [spec.keys for spec in config.parameters] == [["plate.bsdf.alpha.value"]]
     assert config.target.exposure == "auto"
@@ -325,7 +327,7 @@ def test_one_of_several_sensors_is_named(choices: Path) -> None:
     assert [view.sensor for view in config.views] == [0]
     assert config.parameters[0].keys == ["Rectangle_1.bsdf.reflectance.value"]
     (choices / "hall.yaml").unlink()
-    other = reslrb("init", "hall.xml", "--sensor", 1, "--target", write_noise(choices / "photo.png", 12, 8))
+    other = reslrb("init", "hall.xml", "--sensor", 1, "--target", write_noise(choices / "photo.png", 12, 8), "--fit", 0)
     assert "sensor 1 (ball); --sensor selects another: 0 (floor)" in other.output
     config = load(choices / "hall.yaml")
     assert [view.sensor for view in config.views] == [1]
@@ -352,7 +354,7 @@ def test_a_photograph_is_oriented_as_a_person_sees_it(choices: Path) -> None:
 
     def init() -> Result:
         (choices / "hall.yaml").unlink(missing_ok=True)
-        return reslrb("init", "hall.xml", "--sensor", 1, "--target", "photo.jpg")
+        return reslrb("init", "hall.xml", "--sensor", 1, "--target", "photo.jpg", "--fit", 0)
 
     told = "photo.jpg: turned by 90 degrees clockwise, as its EXIF orientation says"
     photograph(8, 12, 6)  # the film is 12x8
@@ -390,7 +392,7 @@ def test_a_scene_that_hides_its_lights_keeps_hiding_them(choices: Path) -> None:
         assert load(choices / "hall.yaml").integrator.hide_emitters == (value == "true")
     scene.write_text(scene.read_text().replace('"false"', '"true"'))
     write_noise(choices / "photo.png", 16, 16)
-    made = tiny.done("init", "hall.xml", "-o", "photo.yaml", "--target", "photo.png")
+    made = tiny.done("init", "hall.xml", "-o", "photo.yaml", "--target", "photo.png", "--fit", 0)
     assert "set it if photo.png does not show them" in made.output
     assert "  # hide_emitters: true" in (choices / "photo.yaml").read_text()
     assert not load(choices / "photo.yaml").integrator.hide_emitters  # the photograph shows what is behind the scene
