@@ -21,6 +21,9 @@ n rises by 1 if the loss now rises along the last step (Kesten 1958), and falls 
 gradients agree, a step uses the newest gradient. When noise dominates, it uses the mean of many. If the loss
 rises by more than 10 % along a step, n is halved (`loop.update`).
 
+A step ends at the bounds. The other coordinates then take the best step beside the shorter ones, with H. Otherwise,
+they would make up for steps that the bounds cut off, and the loss would rise.
+
 The images hardly change if an exposure E rises and all colours c fall. A step dE, dc is therefore taken in E and E c,
 
     E <- E exp(du),   c <- ((1 + du) c + dc) exp(-du),   du = dE / E
@@ -166,11 +169,18 @@ class Block:
         mean_x = mean_x + (now.value - mean_x) / n
         Y = np.where(use, mean_g / root, 0.0) - K @ (mean_x * root - x)
         free = use & ~((now.value <= now.low) & (Y > 0) | (now.value >= now.high) & (Y < 0))
-        A, C = K[np.ix_(free, free)], np.square(2 * now.longest * root)[free]
-        inverse = np.linalg.inv(A @ A + np.diag(NOISE * variance / n / C + 1e-8))
         step, error = np.zeros_like(x), np.zeros_like(x)
-        step[free] = -(inverse @ A @ Y[free]) / root[free]
-        error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
+        while free.any():
+            A, C = K[np.ix_(free, free)], np.square(2 * now.longest * root)[free]
+            inverse = np.linalg.inv(A @ A + np.diag(NOISE * variance / n / C + 1e-8))
+            step[free] = -(inverse @ A @ (Y + K @ np.where(free, 0.0, step * root))[free]) / root[free]
+            error[free] = np.sqrt(np.diag(inverse) * variance / n) / root[free]
+            within = np.clip(step, now.low - now.value, now.high - now.value)
+            outside = free & (within != step)
+            if not outside.any():
+                break
+            # The other coordinates follow the steps of these up to their bounds.
+            step, free = np.where(outside, within, step), free & ~outside
         distance = np.abs(step) + SURE * error
         # The first gradient has no predecessor, so it says nothing about the noise.
         change = np.clip(step, -now.longest, now.longest)
