@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import functools
+import importlib
 import traceback
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -29,6 +31,9 @@ from reslrb_cli.scene.plastic import PlasticTables, with_tables
 
 #: Our integrators by the names of their plugins.
 TRACERS = ("reslrb", "walk_ad", "trajectory")
+
+#: Files of our integrators.
+_FILES = (__file__, str(Path(__file__).with_name("reslrb_basic.py")))
 _registered_with_callback = False
 
 #: Options of `reslrb` and their defaults. The estimator has more (`options_of`). With an estimator that the user names,
@@ -153,8 +158,17 @@ def _on_variant(old: str | None, new: str) -> None:
         mi.render = _with_reasons(mi.render)
     for name in TRACERS:
         mi.register_integrator(name, lambda props, name=name: plugin(name, props))
+    mi.register_integrator("reslrb_basic", _basic if usable else lambda props: check_variant(mi.variant()))
     if usable:
         dispersion.register()
+
+
+def _basic(props: mi.Properties) -> mi.Integrator:
+    """Make a `reslrb_basic` of the current variant. Its class derives from a class of the variant."""
+    module = importlib.import_module(f"{__package__}.reslrb_basic")
+    if mi.variant() != module.VARIANT:
+        module = importlib.reload(module)
+    return module.ReslrbBasic(props)
 
 
 def _with_reasons(render: Callable[..., Any]) -> Callable[..., Any]:
@@ -167,7 +181,7 @@ def _with_reasons(render: Callable[..., Any]) -> Callable[..., Any]:
         except RuntimeError as error:
             cause = error.__cause__
             frames = traceback.walk_tb(cause.__traceback__) if cause is not None else ()
-            if not any(frame.f_code.co_filename == __file__ for frame, _ in frames):
+            if not any(frame.f_code.co_filename in _FILES for frame, _ in frames):
                 raise
             assert cause is not None
             reason = cause
