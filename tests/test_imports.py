@@ -200,9 +200,15 @@ def test_commands_load_numpy_and_scipy_without_idle_threads() -> None:
     assert int(done.stdout) > 1 or len(os.sched_getaffinity(0)) == 1
 
 
+#: A module whose class derives from a class of the current variant, as in Mitsuba's own integrators. Only its plugin
+#: loads it.
+OF_A_VARIANT = "reslrb_cli.integrators.reslrb_basic"
+
+
 def test_every_module_can_be_imported_without_a_variant() -> None:
     parts = [path.relative_to(ROOT.parent).with_suffix("").parts for path in ROOT.rglob("*.py")]
     names = sorted({".".join(part for part in module if part != "__init__") for module in parts})
+    names.remove(OF_A_VARIANT)
     script = (
         f"import importlib\nfor name in {names!r}: importlib.import_module(name)\n"
         "import mitsuba as mi; assert mi.variant() is None, mi.variant()"
