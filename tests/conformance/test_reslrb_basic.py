@@ -106,17 +106,18 @@ def test_the_gradient_is_that_of_reslrb(case: Case, reference: np.ndarray):
 def test_the_last_factor_is_that_of_the_sensor(rough: tuple[Case, np.ndarray], tmp_path: Path):
     assert agreement(rough[0], basic(), rough[1], COUNT)
     assert not agreement(
-        rough[0], basic(faulty("dr.select(depth == I, to_sensor, wo)", "wo", tmp_path)), rough[1], COUNT
+        rough[0], basic(faulty("dr.select(depth == I, to_sensor, to_next)", "to_next", tmp_path)), rough[1], COUNT
     )
 
 
+FACTOR = "dr.select(f_s != 0, A / dr.detach(f_s), 0)"
 #: Faults by name: text of the file, and what replaces it.
 FAULTS = {
     "no probability": ("dr.select(I > 0, W / w, 0)", "dr.select(I > 0, 1, 0)"),
     "reservoir's number not replayed": ("sampler.next_1d(active)  # consume_reservoir_rng()", "pass"),
-    "no connection": ("backward_grad(f, A)", "backward_grad(f, dr.select(depth < I, A, 0))"),
-    "connection alone": ("backward_grad(f, A)", "backward_grad(f, dr.select(depth == I, A, 0))"),
-    "no emission": ("backward_grad(E, A)", "pass"),
+    "no connection": (FACTOR, FACTOR.replace("f_s != 0", "(f_s != 0) & (depth < I)")),
+    "connection alone": (FACTOR, FACTOR.replace("f_s != 0", "(f_s != 0) & (depth == I)")),
+    "no emission": ("backward(E, dr.select(E != 0, A / dr.detach(E), 0))", "pass"),
     "stopped where not kept": ("active &= (depth <", "active &= kept & (depth <"),  # as in Figure 4
     "always kept": ("sampler.next_1d(active) * W < w_i", "sampler.next_1d(active) * w_i < w_i"),
 }
@@ -150,14 +151,14 @@ def test_the_replay_meets_the_same_vertices(case: Case, tmp_path: Path):
     module, spp = module_of(FILE.read_text(encoding="utf-8"), tmp_path), 4
     count = spp * int(np.prod(case.weights.shape[:2]))
     met: list[tuple[Any, Any]] = []  # of each pass: the number of vertices, and their film positions
-    connect = module.connect
+    connect = module.connect_to_sensor
 
     def noting(sensor: Any, sampler: Any, si: Any, ray: Any, active: Any) -> Any:
-        ds, wo, rest = connect(sensor, sampler, si, ray, active)
+        ds, wo, importance = connect(sensor, sampler, si, ray, active)
         lane, (numbers, places) = dr.arange(mi.UInt32, count), met[-1]
         slot = dr.scatter_inc(numbers, lane, active)
         dr.scatter(places, ds.uv.x, lane * DEPTH + slot, active)
-        return ds, wo, rest
+        return ds, wo, importance
 
     class Noting(module.ReslrbBasic):  # type: ignore[misc, name-defined]
         def primal(self, *args: Any) -> Any:
@@ -168,7 +169,7 @@ def test_the_replay_meets_the_same_vertices(case: Case, tmp_path: Path):
             met.append((dr.zeros(mi.UInt32, count), dr.full(mi.Float, np.nan, count * DEPTH)))
             return super().adjoint(*args)
 
-    module.connect, module.ReslrbBasic = noting, Noting
+    module.connect_to_sensor, module.ReslrbBasic = noting, Noting
     case.gradient(basic(module), 3, spp)
     _, (numbers, first), (replayed, second) = ((np.array(a), np.array(b)) for a, b in met)
     again = ~np.isnan(second)
@@ -176,6 +177,58 @@ def test_the_replay_meets_the_same_vertices(case: Case, tmp_path: Path):
     assert np.array_equal(first[again], second[again])
     assert 0 < (replayed < numbers).mean() < 1
     assert set(replayed) == set(range(DEPTH))
+
+
+def test_the_gradient_of_a_lamp_in_view_is_that_of_reslrb(llvm: str, tmp_path: Path):
+    """A texture of three channels has a graph between its data and the values of both passes' lookups."""
+    radiance = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.random.default_rng(0).uniform(1, 9, (2, 2, 3)))}
+    sign = lamp(radiance=radiance) | {"to_world": mi.ScalarTransform4f().translate([0, -0.2, 0.5]).scale(0.2)}
+    case = Case(room(sign=sign), ("sign.emitter.radiance.data",))
+    expected = gradients_of_reslrb(case)
+    assert agreement(case, basic(), expected, COUNT)
+    assert not agreement(case, basic(faulty("backward(Le, dr", "dr.detach(dr", tmp_path)), expected, COUNT // 3)
+
+
+@pytest.mark.parametrize("is_right", [True, False])
+def test_the_gradient_reaches_a_value_before_the_parameters(is_right: bool, llvm: str, tmp_path: Path):
+    """`render_backward` without `mi.render`: one number is behind the lamp and the wall."""
+    scene = mi.load_dict(room(lamp=lamp()), optimize=False)
+    params, tracer = mi.traverse(scene), plugin("reslrb_basic", max_depth=DEPTH)
+    if not is_right:
+        properties = mi.Properties("reslrb_basic")
+        properties["max_depth"] = DEPTH
+        tracer = faulty("dr.isolate_grad()", "dr.resume_grad()", tmp_path).ReslrbBasic(properties)
+
+    def set_to(value: mi.Float) -> None:
+        params[LIGHT], params[WALL] = type(params[LIGHT])(10 * value), type(params[WALL])(value)
+        params.update()
+
+    dr.enable_grad(latent := mi.Float(0.5))
+    set_to(latent)
+    ones = dr.ones(mi.TensorXf, tracer.render(scene, spp=1).shape)
+    for seed in range(16):
+        tracer.render_backward(scene, params, ones, seed=seed, spp=64)
+    sums = []
+    for value in (0.49, 0.51):
+        set_to(mi.Float(value))
+        sums.append(np.mean([np.sum(tracer.render(scene, seed=seed, spp=256)) for seed in range(16)]))
+    assert (dr.grad(latent)[0] / 16 == pytest.approx((sums[1] - sums[0]) / 0.02, rel=0.02)) == is_right
+
+
+def test_a_black_lamp_in_view_has_a_derivative(llvm: str):
+    case = Case(room(sign=lamp(radiance=rgb(0, 0, 0)) | {"to_world": mi.ScalarTransform4f().scale(0.3)}),
+                ("sign.emitter.radiance.value",))  # fmt: skip
+    assert (np.abs(case.gradient(basic(), 1, 64)) > 0).all()
+
+
+def test_negative_radiance_gives_the_gradient_of_the_negative_image(llvm: str):
+    """An optimizer may overshoot. The weight of a connection is positive all the same."""
+    bright, negative = (
+        Case(room(lamp=lamp(radiance=rgb(value, value, value))), (WALL,)).gradient(basic(), 1, 64)
+        for value in (10, -10)
+    )
+    assert (bright != 0).all()
+    np.testing.assert_allclose(negative, -bright, rtol=1e-4)
 
 
 def test_under_mi_render(case: Case):
@@ -231,15 +284,20 @@ def test_another_variant_has_another_class():
 MIRROR = sphere({"type": "conductor", "specular_reflectance": rgb(0.9, 0.8, 0.7)}, [0, -0.7, 0], 0.3)
 VEIL = sphere({"type": "mask", "opacity": 0.5, "bsdf": diffuse(0.5, 0.5, 0.5)}, [0, -0.7, 0], 0.3)
 SUN = {"type": "directional", "direction": [0, -1, 0], "irradiance": rgb(1, 1, 1)}
+INSTANCE = {
+    "group": {"type": "shapegroup", "ball": sphere(diffuse(0.5, 0.5, 0.5), [0, -0.7, 0], 0.3)},
+    "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+}
 REFUSED: list[tuple[dict[str, Any], str, str]] = [
     ({"sky": {"type": "constant"}}, "", "reslrb_basic supports area and point lamps, not sky; use reslrb"),
     ({"sun": SUN}, "", "reslrb_basic supports area and point lamps, not sun; use reslrb"),
     ({"veil": VEIL}, "", "is transparent to shadow rays; use reslrb"),
-    ({"camera": {"type": "orthographic", "id": "camera"}}, "", "reslrb_basic cannot connect to sensor camera"),
+    ({"camera": {"type": "orthographic", "id": "camera"}}, "", "supports perspective and thinlens, not sensor camera"),
     ({"fog": sphere(glass(), [0, 0, 0], 0.3) | {"interior": {"type": "homogeneous"}}}, "", "participating media"),
-    ({}, "floor_shape.to_world", "floor_shape.to_world: reslrb_basic has detached derivatives"),
-    ({}, "lamp.to_world", "lamp.to_world: reslrb_basic has detached derivatives"),
-    ({}, "camera.to_world", "camera.to_world: reslrb_basic has detached derivatives"),
+    (INSTANCE, "", "neither participating media nor instances, as in shape copy"),
+    ({}, "floor_shape.to_world", "floor_shape.to_world: reslrb_basic has derivatives of BSDFs and of emission only"),
+    ({}, "lamp.to_world", "lamp.to_world: reslrb_basic has derivatives"),
+    ({}, "camera.to_world", "camera.to_world: reslrb_basic has derivatives"),
     ({"ball": MIRROR}, "ball.bsdf.specular_reflectance.value", "has no derivatives of smooth specular BSDFs"),
 ]
 
@@ -255,6 +313,25 @@ def test_refusals_are_one_line_under_mi_render(more: dict[str, Any], key: str, r
         dr.backward(dr.mean(mi.render(scene, params, integrator=plugin("reslrb_basic"), spp=1), axis=None))
     assert reason in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_texture_of_a_smooth_bsdf_is_refused_beside_a_diffuse_one():
+    """The dictionary of parameters names one of its parents only."""
+    shared = {"type": "ref", "id": "shared"}
+    scene = mi.load_dict(
+        {"type": "scene", "shared": texture(2, 2)}
+        | room(
+            ball=sphere({"type": "diffuse", "reflectance": shared}, [0, 0, 0], 0.3),
+            other=sphere({"type": "conductor", "specular_reflectance": shared}, [0, -0.7, 0], 0.3),
+        ),
+        optimize=False,
+    )
+    params = mi.traverse(scene)
+    [key] = [key for key in params.properties if key.endswith(".data")]
+    dr.enable_grad(params[key])
+    params.update()
+    with pytest.raises(UnsupportedScene, match="no derivatives of smooth specular BSDFs"):
+        dr.backward(dr.mean(mi.render(scene, params, integrator=plugin("reslrb_basic"), spp=1), axis=None))
 
 
 def test_forward_mode_is_refused():
