@@ -336,6 +336,18 @@ def with_a_file(loss: str, spp: int, iterations: int = 150) -> Toy:
     return Toy(f"{loss}, {spp} spp", {WALL: COLOR}, {}, settings)
 
 
+def test_images_along_all_directions_share_a_recording(folder):
+    """A recording depends on which parameters of the scene have derivatives."""
+    keys = (WALL, LEFT, RIGHT)
+    parameters = ", ".join(f"{{key: {key}, initial: [0.4, 0.5, 0.6], bounds: [0, 20]}}" for key in keys)
+    problem = assemble(load(folder / "toy.yaml", [f"parameters=[{parameters}]", "run.spp=4"]))
+    problem.apply()
+    changes = plan_changes(problem, dict.fromkeys(keys, 0.5), 0.05)
+    directions, *_ = LossCurvature(problem, 4).along(changes, lambda: True)
+    assert len(directions) == 9
+    assert problem.integrator.preparation.recordings.counts()["image"] <= 2
+
+
 @pytest.mark.parametrize(("loss", "is_biased"), [("l1", True), ("l2", False), ("relative_l2", False)])
 def test_only_losses_that_noise_biases_have_a_bias(loss, is_biased, folder):
     """The bias enters B along directions and by entry."""
