@@ -24,6 +24,7 @@ from reslrb_cli.cli.inspect import LISTED_SENSORS
 from reslrb_cli.cli.options import check_writable
 from reslrb_cli.cli.terminal import echo, fill
 from reslrb_cli.config.loader import loads, parse_override
+from reslrb_cli.config.parameters import entry_of, tinted_by
 from reslrb_cli.config.yaml_text import write
 from reslrb_cli.errors import ConfigError, UnsupportedScene, describe, printable
 from reslrb_cli.records.atomic import write_atomically, writing
@@ -123,7 +124,8 @@ def _comment(text: str) -> list[str]:
 
 def _entry(proposal: Proposal) -> str:
     """Return the entry of a parameter."""
-    parts = [f"key: {_text(proposal.info.key)}"]
+    option, name = entry_of(proposal.key)
+    parts = [f"{option}: {_text(name)}"]
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
     return "{" + ", ".join(parts) + "}"
@@ -136,8 +138,8 @@ def _note(proposal: Proposal, explained: Mapping[str, float] = MappingProxyType(
     if value is not None:
         numbers = None if value.numbers is None else " ".join(f"{number:.3g}" for number in value.numbers)
         parts.append(f"{value.low:.3g} to {value.high:.3g}" if numbers is None else f"now {numbers}")
-    if info.key in explained:
-        parts.append(f"explains {100 * explained[info.key]:.0f} % of the misfit")
+    if proposal.key in explained:
+        parts.append(f"explains {100 * explained[proposal.key]:.0f} % of the misfit")
     return ", ".join(parts if info.remark is None else [*parts, info.remark])
 
 
@@ -210,17 +212,17 @@ def command(
 ) -> None:
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
-    The configuration recovers the colours of the materials that are largest in view, the roughness of rough conductors
-    and glass, and the brightness of visible lamps. Textures with a pattern keep it. Lamps are left out if the
-    photograph has 8 or 16 bits, because such a photograph clips the lamps. All other recoverable parameters are listed
-    as comments with bounds and current values. Remove the # of those that you want. Shapes in view that can be moved
-    are listed, too.
+    The configuration recovers the colours of the materials that are largest in view, the roughness of rough
+    conductors and glass, and the brightness of visible lamps. Textures with a pattern keep it, and have a tint.
+    Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips the lamps. All other
+    recoverable parameters are listed as comments with bounds and current values. Remove the # of those that you
+    want. Shapes in view that can be moved are listed, too.
 
     With --target, the command first fits the photograph with few samples. If the colours do not explain the
-    photograph, the configuration also recovers what does: roughnesses, the camera's response, or both. The film gets
-    the photograph's aspect ratio. The film's size is such that a run takes minutes. If the photograph has another size
-    than the film, the command writes a resized copy beside the configuration. If there are several sensors, the first
-    one is used, unless --sensor names another.
+    photograph, the configuration also recovers what does: roughnesses, the camera's response, or both, or the tint
+    of a texture. The film gets the photograph's aspect ratio. The film's size is such that a run takes minutes. If
+    the photograph has another size than the film, the command writes a resized copy beside the configuration. If
+    there are several sensors, the first one is used, unless --sensor names another.
     """
     from reslrb_cli.backend.variant import set_variant
 
@@ -302,7 +304,7 @@ def command(
 
 def _with_freed(proposals: Sequence[Proposal], freed: Sequence[str]) -> list[Proposal]:
     """Return the proposals, with those of the keys `freed` among the first ones."""
-    return [replace(each, first=each.first or each.info.key in freed) for each in proposals]
+    return [replace(each, first=each.first or each.key in freed) for each in proposals]
 
 
 def _try_out(
@@ -312,7 +314,7 @@ def _try_out(
     """Fit the photograph. Return None after an error, which does not lose the configuration."""
     from reslrb_cli.optimization.first_fit import assemble_first_fit, try_out
     from reslrb_cli.optimization.uncertainty.measuring import Budget
-    from reslrb_cli.scene.proposal import write_smaller
+    from reslrb_cli.scene.proposal import LEAST_SHARE, write_smaller
 
     began = time.perf_counter()
     try:
@@ -320,11 +322,12 @@ def _try_out(
             image = Path(folder) / ("photo.png" if photo.white is not None else "photo.exr")
             write_smaller(photo, size, image, is_raw)
             path = Path(folder) / "fit.yaml"
+            tinted = [each.info.key for each in proposals if tinted_by(each.key) and each.share >= LEAST_SHARE]
 
             def make(freed: Sequence[str]) -> Problem:
                 text = write_config(path, target=image, proposals=_with_freed(proposals, freed), freed=freed)
                 # Raises an error if an exposure makes up for all that is freed.
-                return assemble_first_fit(loads(text, path), size, has_camera, to_run=bool(freed))
+                return assemble_first_fit(loads(text, path), size, has_camera, bool(freed), tinted)
 
             found = try_out(make, proposals, Budget(seconds, lambda: False))
             if found is not None and found.freed:
@@ -351,7 +354,7 @@ def _found_words(found: FirstFit) -> str:
         named = ", ".join(words.get(key, printable(key)) for key in found.freed[:_MOST_NAMED])
         more = " ..." if len(found.freed) > _MOST_NAMED else ""
         return f"{left}, so the run also recovers {named}{more}"
-    return f"{left}, which neither roughnesses nor a camera's response explain"
+    return f"{left}, which neither roughnesses nor a camera's response nor the tint of a texture explain"
 
 
 def choose_size(film: Size, photo: StoredImage | None, fixed: bool = False) -> Size:

@@ -1,4 +1,5 @@
-"""The parameters to recover: scene parameters by key, heightmaps on meshes, and motions of shapes and emitters.
+"""The parameters to recover: scene parameters by key, tints of textures, heightmaps on meshes, and motions of shapes
+and emitters.
 
 Settings of a motion are given for each part (translation, rotation, scale), or for all parts at once.
 """
@@ -44,6 +45,24 @@ ANGLES: tuple[Word, ...] = ("rotation_x", "rotation_y", "rotation_z")
 
 #: Name of a heightmap's parameter, appended to the name of its mesh.
 HEIGHTMAP = "heightmap"
+#: Name of a tint, in place of `data` in the key of its texture.
+TINT = "tint"
+
+
+def tint_of(key: str) -> str:
+    """Return the name of the tint of the texture `key`."""
+    return f"{key.removesuffix('.data')}.{TINT}"
+
+
+def tinted_by(name: str) -> str | None:
+    """Return the key of the texture whose tint is called `name`, or None if `name` is no tint."""
+    return f"{name.removesuffix(f'.{TINT}')}.data" if name.endswith(f".{TINT}") else None
+
+
+def entry_of(key: str) -> tuple[str, str]:
+    """Return the option of an entry of `parameters`, and its value, that recovers `key`: a parameter or a tint."""
+    texture = tinted_by(key)
+    return ("key", key) if texture is None else (TINT, texture)
 
 
 # --- settings of a motion, by part ------------------------------------------------------------------------------------
@@ -297,13 +316,16 @@ class Settings:
 
 
 class ParameterSpec(Section):
-    """A parameter to recover. Exactly one of `key`, `heightmap` and `motion` must be given."""
+    """A parameter to recover. Exactly one of `key`, `tint`, `heightmap` and `motion` must be given."""
 
     key: _Key | None = None
     """Key as `reslrb inspect` lists it. Keys are the names of `mi.traverse`. A shape without an id is named after its
     file, as in `Lamp` for `Lamp.ply`, and another object after its kind and its number, as in `Sphere_3`. A glob such
     as `*.reflectance.data` selects several parameters. A list of keys ties them to one value, which is recorded under
     the first key."""
+    tint: Name | None = None
+    """Key of a bitmap texture whose texels are multiplied by one number for each channel, 1 at the start. The pattern
+    of the texture stays. The numbers are recorded as the key with `tint` in place of `data`."""
     heightmap: HeightmapSpec | None = None
     """Displacement of a mesh, recorded as `MESH.heightmap`."""
     motion: MotionSpec | None = None
@@ -337,9 +359,11 @@ class ParameterSpec(Section):
 
     @property
     def names(self) -> list[str]:
-        """The keys and globs of the parameters. For a heightmap or a motion, the property gives the names under which
-        the run records its values.
+        """The keys and globs of the parameters. For a tint, a heightmap or a motion, the property gives the names under
+        which the run records its values.
         """
+        if self.tint is not None:
+            return [tint_of(self.tint)]
         if self.heightmap is not None:
             return [f"{self.heightmap.mesh[0]}.{HEIGHTMAP}"]
         if self.motion is not None:
@@ -348,7 +372,9 @@ class ParameterSpec(Section):
 
     @property
     def keys(self) -> list[str]:
-        """The keys and globs in `key`."""
+        """The keys and globs of scene parameters: those in `key`, or the texture of a tint."""
+        if self.tint is not None:
+            return [self.tint]
         return [self.key] if isinstance(self.key, str) else list(self.key or ())
 
     def objects(self) -> list[tuple[str, int | None, str]]:
@@ -356,6 +382,7 @@ class ParameterSpec(Section):
         each entry comes with its index, too.
         """
         lists: list[tuple[str, Any]] = [("key", self.key)]
+        lists += [] if self.tint is None else [("tint", self.tint)]
         lists += [] if self.heightmap is None else [("heightmap.mesh", self.heightmap.mesh)]
         lists += [] if self.motion is None else [("motion.of", self.motion.of)]
         found: list[tuple[str, int | None, str]] = []
@@ -399,9 +426,10 @@ class ParameterSpec(Section):
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
-        has = [option for option in ("key", "heightmap", "motion") if getattr(self, option) is not None]
+        kinds = ("key", "tint", "heightmap", "motion")
+        has = [option for option in kinds if getattr(self, option) is not None]
         if not has:
-            raise located("", "must have one of `key`, `heightmap` and `motion`")
+            raise located("", "must have one of `key`, `tint`, `heightmap` and `motion`")
         if len(has) > 1:
             raise located(has[1], f"cannot be combined with `{has[0]}`; make two parameters")
         if len(self.keys) > 1:
@@ -411,10 +439,10 @@ class ParameterSpec(Section):
                 raise located("resolution", "needs a single key, not a list of tied keys")
         if self.heightmap is not None and self.resolution is not None:
             raise located("resolution", "has no effect here; set `heightmap.resolution` instead")
-        if self.motion is not None and self.resolution is not None:
-            raise located("resolution", "has no effect on a motion; remove it")
-        if self.motion is not None and self.precondition is not None:
-            raise located("precondition", "has no effect on a motion; remove it")
+        kind = "motion" if self.motion is not None else TINT if self.tint is not None else ""
+        for option in ("resolution", "precondition") if kind else ():
+            if getattr(self, option) is not None:
+                raise located(option, f"has no effect on a {kind}; remove it")
         return self
 
     @model_validator(mode="after")

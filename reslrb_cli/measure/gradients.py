@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.backend.memory import own_memory
-from reslrb_cli.config.parameters import ANGLES
+from reslrb_cli.config.parameters import ANGLES, tinted_by
 from reslrb_cli.integrators.plugin import make_integrator
 from reslrb_cli.integrators.protocol import Job, first_channels
 from reslrb_cli.integrators.step import gradient_step, known_step, render_image
@@ -35,6 +35,7 @@ from reslrb_cli.scene.catalog import parameter_kind
 from reslrb_cli.scene.deformation import Deformation
 from reslrb_cli.scene.dispersion import COEFFICIENT, bends_light
 from reslrb_cli.scene.parameters import Selection
+from reslrb_cli.scene.tints import Tints
 from reslrb_cli.scene.upsampling import Upsampling
 from reslrb_cli.statistics import rms
 
@@ -64,7 +65,7 @@ def moves_light(params: mi.SceneParameters, key: str) -> bool:
     `params` does not contain motions or heightmaps.
     """
     if key not in params.properties:
-        return True
+        return tinted_by(key) is None
     kind = parameter_kind(params, key)
     return (
         bends_light(params, key)
@@ -241,7 +242,8 @@ class Case:
         self.sensor = sensor
         if values is None:
             params = mi.traverse(self.scene)
-            values = Selection(params, {}, {}, Deformation(params), Upsampling(params))
+            colours = Upsampling(params)
+            values = Selection(params, {}, {}, Deformation(params), Tints(params, colours), colours)
             for key in keys:
                 values.colours.add(key)
         self.values, self.params = values, values.params

@@ -15,6 +15,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from reslrb_cli.config.parameters import tinted_by
 from reslrb_cli.measure.gradients import moves_light
 from reslrb_cli.optimization.loading import lit_emitters
 from reslrb_cli.optimization.problem import Problem
@@ -107,8 +108,9 @@ def of_image(
 
 def of_gradient(at: Situation, key: str) -> dict[Reference, str | None]:
     """Return the reason against each stock integrator as reference for the gradient with respect to `key`. The
-    integrators have the order of `of_image`.
+    integrators have the order of `of_image`. The derivative of a tint is that of its texture.
     """
+    key = tinted_by(key) or key
     reasons = {Reference.PTRACER: ptracer_gradient, Reference.PRB: prb_gradient}
     return {name: reasons[name](at, key) for name in of_image(at)}
 

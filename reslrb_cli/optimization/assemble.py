@@ -84,18 +84,20 @@ def assemble(
     cache: DecisionCache | None = None,
     to_run: bool = False,
     settled: Stored | None = None,
+    keys: Iterable[str] = (),
 ) -> Problem:
     """Load and check the experiment of `config`, make the targets, and decide open settings. A variant must be set.
 
     All checks happen before anything is rendered. `say` is called with lines about slow work. `cache` has measurements
     of earlier runs, or is None to store nothing. If `to_run` is True, prepare everything for an optimisation. If
-    `to_run` is True, check exposures, and find the parameter entries that light and sensor reach. With `settled`,
+    `to_run` is True, check exposures, and find the parameter entries that light and sensor reach. `keys` are further
+    parameters whose values will change. With `settled`,
     measure nothing again. With `settled`, the result is a resumed run's problem before the first iteration. Raises
     ConfigError and UnsupportedScene.
     """
     if to_run:
         check_code(config)
-    problem = assemble_scene(config)
+    problem = assemble_scene(config, keys=keys)
     if isinstance(problem.integrator, OwnIntegrator):
         problem.integrator.ready()
     if settled is not None:
@@ -201,7 +203,9 @@ def assemble_scene(config: Config, scene: Any = None, keys: Iterable[str] = ()) 
         samples_per_pass=samples_per_pass(config),
         regularizers=make_regularizers(selection) | response_costs(views),
         quantities={
-            key: "" if key in selection.factors else motions.get(key) or quantity(selection.params, key)
+            key: ""
+            if key in selection.factors or key in selection.tints
+            else motions.get(key) or quantity(selection.params, key)
             for key in selection.keys
         },
     )

@@ -30,6 +30,7 @@ import mitsuba as mi
 import numpy as np
 
 from reslrb_cli.config.loader import changed
+from reslrb_cli.config.parameters import tinted_by
 from reslrb_cli.config.schema import Config
 from reslrb_cli.optimization.assemble import assemble, set_values
 from reslrb_cli.optimization.nonfinite import finite
@@ -87,13 +88,16 @@ class FirstFit:
     explained: dict[str, float] = field(default_factory=dict)
 
 
-def assemble_first_fit(config: Config, size: tuple[int, int], has_camera: bool, to_run: bool = False) -> Problem:
+def assemble_first_fit(
+    config: Config, size: tuple[int, int], has_camera: bool, to_run: bool = False, keys: Sequence[str] = ()
+) -> Problem:
     """Return the problem of `config` with settings that need no measurements, and with camera paths if they can render
-    the scene (`has_camera`). `size` is the film's (width, height). `to_run` is that of `assemble`.
+    the scene (`has_camera`). `size` is the film's (width, height). `to_run` and `keys` are those of `assemble`.
     """
     spp = min(2 ** math.ceil(math.log2(max(SAMPLES / (size[0] * size[1]), 1))), MOST_SPP)
     settings = ["guiding=off", "pixels=even", *(["paths=camera"] if has_camera else [])]
-    return assemble(changed(config, [f"run.spp={spp}", *(f"integrator.{each}" for each in settings)]), to_run=to_run)
+    return assemble(changed(config, [f"run.spp={spp}", *(f"integrator.{each}" for each in settings)]), to_run=to_run,
+                    keys=keys)  # fmt: skip
 
 
 def try_out(
@@ -108,7 +112,7 @@ def try_out(
     problem = make([])
     if not _leave_textures_out(problem):
         return None
-    rough = {each.info.key: each for each in proposals if is_roughness(each)}
+    rough = {each.key: each for each in proposals if is_roughness(each)}
     problem, is_fitted = fit_by_differences(problem, go_on)
     look = _look(problem, rough, go_on) if is_fitted else None
     if look is None:
@@ -125,7 +129,7 @@ def try_out(
     if not name or look.effects[name] < least:
         # The images distinguish a lamp from the exposure only if there is another lamp.
         is_lamp = bool(EMISSION.search(best)) and len(problem.scene.emitters()) > 1
-        return FirstFit(record.misfit, [best] if is_lamp else [], explained)
+        return FirstFit(record.misfit, [best] if is_lamp or tinted_by(best) else [], explained)
     keys = {ROUGHNESSES: list(rough), RESPONSE: [RESPONSE]}
     freed, rest = keys[name], {} if name == ROUGHNESSES else rough
     # A response and roughnesses explain a part of each other's misfits, so the rest is tested after a second fit.
@@ -171,12 +175,12 @@ def _look(problem: Problem, rough: Mapping[str, Proposal], go_on: Callable[[], b
 
 
 def has_candidates(scene: mi.Scene, proposals: Sequence[Proposal], has_response: bool) -> bool:
-    """Return whether a first fit may add parameters: a response that may be unknown, roughnesses in view, or lamps
-    beside others.
+    """Return whether a first fit may add parameters: a response that may be unknown, roughnesses in view, tints of
+    textures, or lamps beside others.
     """
     has_lamp = any(EMISSION.search(each.info.key) and not each.first for each in proposals)
     is_lamp = has_lamp and len(scene.emitters()) > 1
-    return has_response or is_lamp or any(is_roughness(each) for each in proposals)
+    return has_response or is_lamp or any(is_roughness(each) or tinted_by(each.key) for each in proposals)
 
 
 def is_roughness(proposal: Proposal) -> bool:

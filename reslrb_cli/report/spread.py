@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from reslrb_cli.config.parameters import entry_of
 from reslrb_cli.report.format import number
 
 #: Verdict of a value that has not converged (`verdicts.Verdict`).
@@ -99,4 +100,5 @@ def _spec(candidate: Mapping[str, Any]) -> str:
     if candidate["key"] == "response":
         return "target.response: {curve: auto}"
     bounds = f", bounds: {candidate['bounds']}" if candidate.get("bounds") else ""
-    return f"- {{key: {candidate['key']}{bounds}}}"
+    option, name = entry_of(candidate["key"])
+    return f"- {{{option}: {name}{bounds}}}"

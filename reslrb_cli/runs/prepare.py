@@ -23,7 +23,6 @@ import numpy as np
 from reslrb_cli.backend.doctor import device_name
 from reslrb_cli.config.integrators import ReslrbConfig
 from reslrb_cli.config.loader import changed, dump
-from reslrb_cli.config.parameters import ParameterSpec
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.yaml_text import flattened
 from reslrb_cli.errors import ConfigError, printable
@@ -46,7 +45,7 @@ from reslrb_cli.records.tree import Arrays, Stored, entries, entry, expected
 from reslrb_cli.report.tonemap import exposure_for
 from reslrb_cli.runs.callbacks import Callback, Calls, RunInfo
 from reslrb_cli.runs.log import collected
-from reslrb_cli.scene.catalog import describe, owner_of
+from reslrb_cli.scene.catalog import describe
 from reslrb_cli.scene.files import file_digests, files_of
 from reslrb_cli.scene.needs import unsupported_part
 from reslrb_cli.scene.parameters import select_parameters
@@ -368,7 +367,7 @@ def with_freed(config: Config, keys: Sequence[str], source: str) -> Config:
     Raises a ConfigError, located by `source`, for a key that the scene does not have, that cannot be recovered, or that
     the experiment recovers already.
     """
-    from reslrb_cli.scene.proposal import spec_of, usual_bounds  # late, because few runs need them
+    from reslrb_cli.scene.proposal import bounds_of, spec_of  # late, because few runs need them
 
     if wrong := [key for key in keys if not isinstance(key, str) or not key]:
         raise ConfigError(source, "", f"is {wrong[0]!r}; give a key that `reslrb inspect` lists")
@@ -378,17 +377,19 @@ def with_freed(config: Config, keys: Sequence[str], source: str) -> Config:
         keys = [key for key in keys if key != RESPONSE]
     if not keys:
         return config
-    scene = load_configured(config, keys=keys)
+    scene = load_configured(config, keys=[own for key in keys for own in spec_of(key).keys])
     try:
-        specs = [*config.parameters, *(ParameterSpec(key=key) for key in keys)]
+        specs = [*config.parameters, *map(spec_of, keys)]
         params = select_parameters(scene, specs, config.source).params
     except ConfigError as error:
         place = re.match(r"parameters\[(\d+)\]", error.key)
         if place is None or int(place[1]) < len(config.parameters):
             raise
         raise ConfigError(source, "", error.message) from None
-    if globs := [key for key in keys if key not in params.properties]:
+    owners = [spec_of(key).keys[0] for key in keys]
+    if globs := [key for key in owners if key not in params.properties]:
         raise ConfigError(source, "", f"`{globs[0]}` is a glob; name each parameter")
-    bounds = (usual_bounds(describe(params, key, values=True), owner_of(params, key)) for key in keys)
+    infos = (describe(params, key, values=True) for key in owners)
+    bounds = (bounds_of(params, info, key != info.key) for key, info in zip(keys, infos, strict=True))
     freed = [spec_of(*each) for each in zip(keys, bounds, strict=True)]
     return config.model_copy(update={"parameters": [*config.parameters, *freed]})

@@ -30,7 +30,7 @@ _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 #: Parameters of a mesh besides attributes such as `vertex_color`.
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 #: Colours of materials, in which a photograph usually differs most from a scene.
-COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data))?$")
+COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data|tint))?$")
 #: Uniform emission of lamps.
 EMISSION = re.compile(r"\b(radiance|irradiance|intensity)(\.values?)?$")
 #: Ranges at whose ends Mitsuba's derivative is not that of the image, by the class of the BSDF and the name of the

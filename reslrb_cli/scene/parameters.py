@@ -17,12 +17,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness
+from reslrb_cli.config.parameters import HEIGHTMAP, REGULARIZERS, WORDS, ParameterSpec, Settings, Thickness, tint_of
 from reslrb_cli.errors import did_you_mean
 from reslrb_cli.scene.catalog import MARGIN, ParameterInfo, describe, list_parameters, open_domain, unused
 from reslrb_cli.scene.deformation import Deformation, Movable, find_movable
 from reslrb_cli.scene.load import warn_once
 from reslrb_cli.scene.plastic import PlasticTables
+from reslrb_cli.scene.tints import Tints, tint_obstacle
 from reslrb_cli.scene.upsampling import Upsampling
 from reslrb_cli.scene.values import (
     Array,
@@ -42,8 +43,8 @@ class Selection:
 
     `params` is the complete result of `mi.traverse` for the scene. `specs` maps each key to its settings. Keys follow
     the order of the configuration. Keys that match one glob follow the order of the scene. A key is an entry of
-    `params` or a value of `deformation`, for example a motion's `ID.translation` or a heightmap. In a spectral variant,
-    `colours` has the colours whose spectra are in the scene. `tied` maps a key of
+    `params`, the name of a tint, or a value of `deformation`, for example a motion's `ID.translation` or a heightmap.
+    In a spectral variant, `colours` has the colours whose spectra are in the scene. `tied` maps a key of
     `params` to the other keys of `params` that share its value. `factors` are values outside of the scene that multiply
     its images (`add_factor`).
     """
@@ -52,6 +53,7 @@ class Selection:
     specs: dict[str, Settings]
     tied: dict[str, list[str]]
     deformation: Deformation
+    tints: Tints
     colours: Upsampling
     factors: dict[str, Any] = field(default_factory=dict)
 
@@ -69,7 +71,14 @@ class Selection:
         """Entries of `params` that the recovered values determine."""
         own = [key for key in self.keys if self._holder(key) is self.params]
         own += [other for key in own for other in self.tied.get(key, ())]
-        return [*own, *self.colours.keys, *self.deformation.keys]
+        return [*own, *self.placed_keys]
+
+    @property
+    def placed_keys(self) -> list[str]:
+        """Entries of `params` that are functions of recovered values: colours, textures with a tint, and moved
+        objects.
+        """
+        return list(dict.fromkeys([*self.colours.keys, *self.tints.keys, *self.deformation.keys]))
 
     def kind(self, key: str) -> str:
         """Return the kind of `key` for regularizers: `heightmap`, `bitmap`, `mesh`, or "" for other parameters."""
@@ -118,19 +127,21 @@ class Selection:
             for each in keys:
                 holder[each] = value
             own += keys if holder is self.params else []
-        moved = self.deformation.place() + self.colours.place()
+        moved = self._place()
         self.params.update()
-        settled = settle(self.params, (*own, *self.colours.keys, *self.deformation.keys))
+        settled = settle(self.params, (*own, *self.placed_keys))
         dr.eval([self.params[key] for key in own], moved, settled, self.factors)
 
     def collect(self) -> None:
-        """Propagate the gradients at moved objects and at spectra back to the recovered values."""
+        """Propagate the gradients at moved objects, spectra and texels back to the recovered values."""
         self.deformation.collect()
         self.colours.collect()
+        self.tints.collect()
 
     def push(self) -> None:
-        """Propagate tangents to the scene from the values that move objects, and from colours."""
+        """Propagate tangents to the scene from the values that move objects, from tints, and from colours."""
         self.deformation.push()
+        self.tints.push()
         self.colours.push()
         PlasticTables(self.params).push()
 
@@ -149,9 +160,12 @@ class Selection:
         for key, others in self.tied.items():
             for other in others if key not in self.colours else ():
                 self.params[other] = type(self.params[other])(self.params[key])
-        self.deformation.place()
-        self.colours.place()
+        self._place()
         self.params.update()
+
+    def _place(self) -> list[Any]:
+        """Set the entries of `params` that are functions of recovered values. Returns the arrays to evaluate."""
+        return self.deformation.place() + self.tints.place() + self.colours.place()
 
     def slot(self, key: str) -> ParameterValue:
         """Return an object that reads and sets the value of `key`. Call `update` afterwards."""
@@ -161,6 +175,8 @@ class Selection:
         """Return the object that stores the value of `key`."""
         if key in self.factors:
             return self.factors
+        if key in self.tints:
+            return self.tints
         if key in self.colours:
             return self.colours
         return self.deformation.values if key in self.deformation.values else self.params
@@ -243,16 +259,17 @@ def put_values(selection: Selection, values: Mapping[str, Any], source: object, 
     Values are checked like initial values. Errors name `option` and the key. A heightmap may have the resolution of its
     image file.
     """
-    names = [*selection.deformation.values, *selection.factors]
+    names = [*selection.tints.names, *selection.deformation.values, *selection.factors]
     given: dict[str, str] = {}
     for pattern, value in values.items():
         place = Place(source, f"{option}.{pattern}" if option else pattern, lambda _: "")  # a number has no options
         for key in [pattern] if pattern in names else matching_keys(selection.params, pattern, place, names):
             if key in given:
                 raise place.fail("", f"`{key}` is already matched by `{given[key]}`")
-            if key in selection.deformation.keys:
-                by = " and ".join(f"`{name}`" for name in selection.deformation.values)
-                raise place.fail("", f"`{key}` depends on {by} here")
+            by = [*selection.deformation.values] if key in selection.deformation.keys else []
+            by += [tint_of(key)] if key in selection.tints.keys else []
+            if by:
+                raise place.fail("", f"`{key}` depends on {' and '.join(f'`{name}`' for name in by)} here")
             given[key] = pattern
             selection.colours.add(key)
             slot = selection.slot(key)
@@ -274,7 +291,8 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
     chosen: dict[str, Settings] = {}
     tied: dict[str, list[str]] = {}
     origin: dict[str, int] = {}  # of recovered parameters, and of all scene parameters that they determine
-    deformation = Deformation(params)
+    deformation, colours = Deformation(params), Upsampling(params)
+    tints = Tints(params, colours)
     for index, spec in enumerate(specs):
         place = Place(source, f"parameters[{index}]")
         if spec.motion is not None or spec.heightmap is not None:
@@ -285,6 +303,11 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
                 deformation.add_heightmap(items, spec.heightmap.resolution)
             for name, word in zip(spec.names, spec.motion.free if spec.motion is not None else ("",), strict=True):
                 chosen[name], origin[name] = spec.settings(word), index
+            continue
+        if spec.tint is not None:
+            key = _tinted_key(params, spec.tint, place, origin)
+            origin[key] = origin[name := tints.add(key)] = index
+            chosen[name] = spec.settings()
             continue
         is_tied = len(spec.keys) > 1
         keys = _tied_keys(params, spec.keys, place) if is_tied else matching_keys(params, spec.keys[0], place)
@@ -303,10 +326,22 @@ def _choose(params: mi.SceneParameters, specs: Sequence[ParameterSpec], source: 
             del chosen[key]  # a glob may select others
             if origin[key] not in {origin[other] for other in chosen if other in origin}:
                 raise Place(source, f"parameters[{origin[key]}]").fail("key", f"`{key}` {why}")
-    colours = Upsampling(params)
     for key in chosen:
         colours.add(key, tied.get(key, ()))
-    return Selection(params, chosen, tied, deformation, colours), origin
+    return Selection(params, chosen, tied, deformation, tints, colours), origin
+
+
+def _tinted_key(params: mi.SceneParameters, key: str, place: Place, origin: Mapping[str, int]) -> str:
+    """Return the key of a texture that has no other entry. Raises ConfigError."""
+    at = Place(place.source, f"{place.key}.tint", lambda _: "")
+    [found, *more] = matching_keys(params, key, at)
+    if more:
+        raise at.fail("", f"`{key}` matches {1 + len(more)} parameters; give each texture its own tint")
+    if (obstacle := tint_obstacle(params, found)) is not None:
+        raise at.fail("", f"`{found}` {obstacle}")
+    if found in origin:
+        raise at.fail("", f"`{found}` is already matched by parameters[{origin[found]}]")
+    return found
 
 
 def _movables(params: mi.SceneParameters, spec: ParameterSpec, place: Place, origin: dict[str, int]

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 import yaml
 
-from reslrb_cli.config.parameters import ParameterSpec
+from reslrb_cli.config.parameters import ParameterSpec, entry_of, tint_of
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
 from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters, owner_of
@@ -27,6 +27,8 @@ from reslrb_cli.scene.images import StoredImage
 from reslrb_cli.scene.needs import surfaces_met
 from reslrb_cli.scene.rays import grid, sensor_rays
 from reslrb_cli.scene.response import decode_srgb
+from reslrb_cli.scene.tints import tint_obstacle
+from reslrb_cli.scene.values import COLOURS
 
 Image = np.ndarray[Any, Any]
 
@@ -123,8 +125,8 @@ class Proposal:
     """Parameter that could be recovered. `share` is the share of the picture that the parameter colours, or 0 if the
     parameter is not visible.
 
-    `bounds` are YAML, or None. `resolution` is the (width, height) of a texture with many texels, or None. `first` is
-    true if the parameter is recovered by default.
+    A texture with a pattern is recovered by its tint (`is_tint`). `bounds` are YAML, or None. `resolution` is the
+    (width, height) of a texture with many texels, or None. `first` is true if the parameter is recovered by default.
     """
 
     info: ParameterInfo
@@ -132,6 +134,12 @@ class Proposal:
     bounds: str | None
     resolution: tuple[int, int] | None
     first: bool
+    is_tint: bool = False
+
+    @property
+    def key(self) -> str:
+        """Name of the recovered parameter: the key of `info`, or the name of its tint."""
+        return tint_of(self.info.key) if self.is_tint else self.info.key
 
 
 def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]:
@@ -166,9 +174,16 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     emitters = [info.key for info, _ in found if info.kind == "emitter" and info.key not in placed]
     first = [key for key in keys if key in seen][:MOST_FIRST] or emitters[:1] or keys[:1]
     return [
-        Proposal(info, share, usual_bounds(info, owner_of(params, info.key)), _resolution(info), info.key in first)
-        for info, share in found
-    ]
+        Proposal(info, share, bounds_of(params, info, is_tint), None if is_tint else _resolution(info),
+                 info.key in first, is_tint)
+        for info, share in found for is_tint in [has_tint(params, info)]
+    ]  # fmt: skip
+
+
+def has_tint(params: mi.SceneParameters, info: ParameterInfo) -> bool:
+    """True if a texture of colours has a pattern that the scene knows, so that only its tint is recovered."""
+    is_colours = bool(COLOURS.search(info.key))
+    return is_colours and is_pattern(params, info) and tint_obstacle(params, info.key) is None
 
 
 def is_pattern(params: mi.SceneParameters, info: ParameterInfo) -> bool:
@@ -264,9 +279,21 @@ def _shares(scene: mi.Scene, index: int) -> dict[Any, float]:
     return shares
 
 
-def spec_of(key: str, bounds: str | None) -> ParameterSpec:
-    """Return the entry of `parameters` that recovers `key` within the `bounds` of `usual_bounds`."""
-    return ParameterSpec(key=key, bounds=None if bounds is None else yaml.safe_load(bounds))
+def spec_of(key: str, bounds: str | None = None) -> ParameterSpec:
+    """Return the entry of `parameters` that recovers `key` within the `bounds` of `bounds_of`. `key` may be the name of
+    a tint.
+    """
+    option, name = entry_of(key)
+    return ParameterSpec.model_validate({option: name, "bounds": None if bounds is None else yaml.safe_load(bounds)})
+
+
+def bounds_of(params: mi.SceneParameters, info: ParameterInfo, is_tint: bool) -> str | None:
+    """Return the usual bounds of a parameter as YAML, or None. Those of its tint keep the texels within the bounds."""
+    bounds = usual_bounds(info, owner_of(params, info.key))
+    if not is_tint or bounds is None:
+        return bounds
+    low, high = yaml.safe_load(bounds)
+    return f"[{low}, {high / info.value.high:.4g}]" if info.value is not None and np.isfinite(high) else "[0, .inf]"
 
 
 def usual_bounds(info: ParameterInfo, owner: tuple[str, str] = ("", "")) -> str | None:

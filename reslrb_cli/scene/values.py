@@ -37,7 +37,7 @@ class Place:
 
 
 #: Textures of colours. Scenes mark them as `raw`, too, if their own files are linear.
-_COLOURS = re.compile(r"(reflectance|transmittance|base_color|color\d|radiance|irradiance|intensity)\.data$")
+COLOURS = re.compile(r"(reflectance|transmittance|base_color|color\d|radiance|irradiance|intensity)\.data$")
 
 
 class ParameterValue:
@@ -66,7 +66,7 @@ class ParameterValue:
         """True for heights, and for `raw` textures that are no colours. Files of 8 bits are then linear."""
         if self._node is None:
             return True
-        return not _COLOURS.search(self.key) and re.search(r"^  raw = 1,$", str(self._node), re.MULTILINE) is not None
+        return not COLOURS.search(self.key) and re.search(r"^  raw = 1,$", str(self._node), re.MULTILINE) is not None
 
     def get(self) -> Array:
         """Return the current value."""

@@ -50,7 +50,11 @@ def proposals(count: int, first: int, kind: str = "bsdf") -> list[Any]:
         value = Value([0.1 * n], 0.1 * n, 0.1 * n, 0.1 * n)
         info = SimpleNamespace(key=f"a{n}.b", kind=kind, value=value, shape=(), remark="odd" if n == 1 else None)
         bounds, size = ("[0, 1]", (4, 3)) if n % 2 else (None, None)
-        found.append(SimpleNamespace(info=info, share=0.5 / (n + 1), bounds=bounds, resolution=size, first=n < first))
+        found.append(
+            SimpleNamespace(
+                key=info.key, info=info, share=0.5 / (n + 1), bounds=bounds, resolution=size, first=n < first
+            )
+        )
     return found
 
 

@@ -18,6 +18,7 @@ from kit import scene, sensor, shape
 
 from reslrb_cli.cli.init import PIXELS, _entry, _note, choose_size
 from reslrb_cli.config.loader import load
+from reslrb_cli.config.parameters import tint_of
 from reslrb_cli.config.schema import Config
 from reslrb_cli.config.views import TargetConfig
 from reslrb_cli.errors import ConfigError
@@ -66,7 +67,7 @@ def test_a_scene_alone_gets_a_configuration_without_a_photograph(folder: Path) -
     assert config.parameters[0].bounds == (0, np.inf)
     assert (config.loss.type, config.optimizer.type, config.integrator.max_depth) == ("relative_l2", "auto", 8)
     # The scene knows the pattern of its texture.
-    assert f"# - {{key: {tiny.KEY}, bounds: [0, 1]}}" in (folder / "room.yaml").read_text()
+    assert f"# - {{tint: {tiny.KEY}, bounds: [0, 1.144]}}" in (folder / "room.yaml").read_text()
     missing = reslrb("optimize", "room.yaml")
     assert missing.exit_code == 2
     assert f"room.yaml: target.file: {folder / 'photo.png'}: no such file" in missing.output
@@ -91,7 +92,7 @@ def test_commented_settings_are_valid(folder: Path) -> None:
     text = (folder / "room.yaml").read_text().replace("  # - {", "  - {")
     (folder / "room.yaml").write_text(text)
     values = assemble_scene(load(folder / "room.yaml")).values()
-    assert set(values) == {tiny.KEY, "lamp.emitter.radiance.value", "lamp.bsdf.reflectance.value"}
+    assert set(values) == {tint_of(tiny.KEY), "lamp.emitter.radiance.value", "lamp.bsdf.reflectance.value"}
 
 
 def test_nothing_is_replaced(folder: Path) -> None:
@@ -119,7 +120,7 @@ def test_a_texture_is_recovered_at_first_unless_it_has_a_pattern(folder: Path, i
     tiny.done("init", "room/scene.xml")
     keys = [key for spec in load(folder / "room.yaml").parameters for key in spec.keys]
     assert (tiny.KEY in keys) is is_flat
-    assert f"- {{key: {tiny.KEY}" in (folder / "room.yaml").read_text()
+    assert f"- {{{'key' if is_flat else 'tint'}: {tiny.KEY}" in (folder / "room.yaml").read_text()
 
 
 def test_a_second_call_with_the_same_photograph_uses_the_same_copy(folder: Path) -> None:
@@ -151,7 +152,7 @@ def test_exposure_is_recovered_if_the_photograph_clips(folder: Path) -> None:
     assert ("exposure: auto" in (folder / "room.yaml").read_text()) is known
     image = np.full((8, 8, 3), 0.5, np.float32)
     mi.Bitmap(image).write(str(folder / "linear.exr"))
-    tiny.done("init", "room/scene.xml", "--target", "linear.exr", "-o", "linear.yaml")
+    tiny.done("init", "room/scene.xml", "--target", "linear.exr", "-o", "linear.yaml", "--fit", 0)
     assert "exposure" not in (folder / "linear.yaml").read_text()
 
 
@@ -164,12 +165,13 @@ def test_an_8_bit_texture_is_offered_recovered_and_exported(folder: Path) -> Non
     scene.write_text(text.replace('<string name="format" value="variant"/>', ""))
     before = scene.read_bytes()
     tiny.done("init", "room/scene.xml")
-    [line] = [line for line in (folder / "room.yaml").read_text().splitlines() if f"- {{key: {tiny.KEY}" in line]
+    [line] = [line for line in (folder / "room.yaml").read_text().splitlines() if f"- {{tint: {tiny.KEY}" in line]
     assert "4x4 texels" in line
     assert line.endswith("8 bits, read as floats if recovered")
     assert line.startswith("  # - ")
     text = (folder / "room.yaml").read_text()
-    (folder / "room.yaml").write_text(text.replace(line, line.replace("# - ", "- ", 1)))
+    entry = line.replace("# - ", "- ", 1).replace("{tint: ", "{key: ")
+    (folder / "room.yaml").write_text(text.replace(line, re.sub(r"bounds: \[.*?\]", "bounds: [0, 1]", entry)))
     sets = ["target={render: {spp: 16}}", "run.iterations=2", "integrator.estimator=stack"]
     tiny.done("optimize", "room.yaml", *(text for each in sets for text in ("--set", each)))
     linear = decode_srgb(pixels.astype(np.float32) / 255)
@@ -483,8 +485,8 @@ def test_an_advised_crop_is_smaller_than_the_photograph_and_is_accepted():
 )
 def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> None:
     info = SimpleNamespace(key="a.b", value=None, shape=(), remark="a remark")
-    assert _note(SimpleNamespace(info=info, share=share)) == f"{words}, a remark"
-    explained = _note(SimpleNamespace(info=info, share=share), {"a.b": 0.236})
+    assert _note(SimpleNamespace(key="a.b", info=info, share=share)) == f"{words}, a remark"
+    explained = _note(SimpleNamespace(key="a.b", info=info, share=share), {"a.b": 0.236})
     assert explained == f"{words}, explains 24 % of the misfit, a remark"
 
 
@@ -498,7 +500,7 @@ def test_a_comment_states_the_share_of_the_picture(share: float, words: str) -> 
 )
 def test_a_comment_states_the_value(shape: tuple[int, ...], value: Value, words: list[str]) -> None:
     info = SimpleNamespace(key="a.b", value=value, shape=shape, remark=None)
-    assert _note(SimpleNamespace(info=info, share=1.0)) == ", ".join(["100 % of the picture", *words])
+    assert _note(SimpleNamespace(key="a.b", info=info, share=1.0)) == ", ".join(["100 % of the picture", *words])
 
 
 @pytest.mark.parametrize(
@@ -552,4 +554,4 @@ def test_usual_bounds(key: str, low: float, high: float, bounds: str | None) -> 
     ],
 )
 def test_an_entry_of_a_parameter(bounds: str | None, resolution: tuple[int, int] | None, text: str) -> None:
-    assert _entry(SimpleNamespace(info=SimpleNamespace(key="a.b"), bounds=bounds, resolution=resolution)) == text
+    assert _entry(SimpleNamespace(key="a.b", bounds=bounds, resolution=resolution)) == text

@@ -104,7 +104,7 @@ ENTRIES: dict[str, str | tuple[str, ...]] = {
     "{key: a, initial: .nan}": "parameters[0].initial: must be a finite",
     "{key: a, resolution: [64, 0]}": ("parameters[0].resolution[1]: ", "1"),
     "{key: a, resolution: [100000, 100000]}": "parameters[0].resolution: must have at most 134217728 texels, not",
-    "{initial: 1}": "parameters[0]: must have one of `key`, `heightmap` and `motion`",
+    "{initial: 1}": "parameters[0]: must have one of `key`, `tint`, `heightmap` and `motion`",
     "{key: 3}": "parameters[0].key: must be text",
     "{key: b}\n  - {key: b}": ("parameters[1].key: ", "parameters[0]"),
     "{key: [a, a]}": "parameters[0].key: must list each key once",

@@ -133,11 +133,13 @@ def render(llvm, tmp_path, monkeypatch):
     return run
 
 
+#: Functions that see the images of a curvature, first at the values and then along directions.
+SEEN = "_see_at see see_images"
 #: Functions that measure an image or a gradient in a run of each way, apart from those of the ways before.
 PLACES = {
     "auto": {
-        "iterate step gradient", "step measure_curvature gradient", "__init__ see see_images",
-        "_derivatives see see_images", "measure sample_gradient", "target_noises _noises render_in_passes",
+        "iterate step gradient", "step measure_curvature gradient", SEEN, "measure sample_gradient",
+        "target_noises _noises render_in_passes",
         "by_entry _two_probes _probe", "_by_entry_of_target _two_probes _probe", "products _two_probes _probe",
         "measure_fit render see_images",
     },
@@ -160,6 +162,7 @@ def test_a_non_finite_value_in_a_measurement_is_left_out_and_counted(render, way
     earlier = {place for name in list(WAYS)[: list(WAYS).index(way)] for place in PLACES[name]}
     assert set(calls) - earlier == PLACES[way]
     planted = [(place, calls[place][:2][-1]) for place in PLACES[way]]
+    planted += [(SEEN, calls[SEEN][3])] if SEEN in PLACES[way] else []  # along a direction
     # For another parameter, or in the measurement after the last iteration.
     planted += [(place, calls[place][-1]) for place in PLACES[way] if way == "sgd" or "_images" in place]
     for place, call in planted:
@@ -176,7 +179,7 @@ def test_a_non_finite_value_in_a_measurement_is_left_out_and_counted(render, way
 @pytest.mark.parametrize("policy", ["stop", "skip", "zero"])
 def test_the_policy_covers_measured_images(render, policy):
     """Only `stop` ends the run. The error names the image."""
-    call = render("auto")[0].places.index("_derivatives see see_images")
+    call = render("auto")[0].places.index(SEEN) + 2  # along a direction
     if policy == "stop":
         with pytest.raises(
             NonFinite, match=r"iteration 0: a measured image of sensor 0 in 3 entries; run\.on_nonfinite"

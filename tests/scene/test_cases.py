@@ -248,6 +248,8 @@ def chosen_parameters(patch: Patch) -> Any:
         [{"motion": {"of": "quilt"}}, {"key": "quilt.vertex_positions"}], [{"key": "floor.translation"}],
         *([{"heightmap": {"mesh": mesh, "resolution": [3, 3]}}] for mesh in ("quilt", "ball")),
         [{"key": "quilt.heightmap"}], [{"key": colour, "initial": [1, 2]}],
+        *([{"tint": name}] for name in (reflectance, colour, "wall.bsdf.diffuse_reflectance.data", "sky.data")),
+        [{"tint": reflectance}, {"key": "*.reflectance.*"}], [{"tint": "*.reflectance.*"}],
         [{"key": colour, "transform": "log", "initial": 0}],
     ]  # fmt: skip
     found = []

@@ -87,7 +87,7 @@ def _find_candidates(
     problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
 ) -> list[tuple[float, float, Candidate]]:
     """Return the further parameters, each after the fall of the loss and its `p`. Significant ones come first."""
-    proposals = {each.info.key: each for each in _unrecovered(problem)}
+    proposals = {each.key: each for each in _unrecovered(problem)}
     if not proposals:
         return []
     others = _recovering(problem, proposals)
@@ -292,7 +292,7 @@ def _candidate(
     problem: Problem, proposal: Proposal, directions: Sequence[ParameterDirection], offset: Array, p: float
 ) -> Candidate:
     """Return the record of a parameter whose directions would change by `offset`."""
-    key = proposal.info.key
+    key = proposal.key
     value = problem.selection.array(key).astype(np.float64).ravel()
     if directions[0].entry is None:
         value, proposed = np.ones(len(directions)), 1 + offset
