@@ -71,7 +71,6 @@ def _first_config(
     proposals: Sequence[Proposal],
     movable: Sequence[tuple[str, float, str, str]],
     explained: Mapping[str, float] = MappingProxyType({}),
-    freed: Sequence[str] = (),
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
@@ -79,8 +78,8 @@ def _first_config(
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
     ids, shares, file names and free motions of the shapes in view that can be moved. `explained` has the shares of the
-    misfit that parameters explain, and `freed` the keys that the photograph asks for (`first_fit.FirstFit`). `known`
-    are other template values.
+    misfit that parameters explain (`first_fit.FirstFit`). `known` are other template values, and `has_response` is true
+    if the response of the camera is recovered.
     """
     from reslrb_cli.optimization.views import RESPONSE
 
@@ -96,9 +95,8 @@ def _first_config(
             "entry": _entry,
             "note": partial(_note, explained=explained),
         },
-        **known,
+        **({"has_response": False} | known),
         file=path.name,
-        has_response=RESPONSE in freed,
         share_of_response=round(100 * explained.get(RESPONSE, 0.0)),
         given=", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in options.items()),
         rest=", ".join([*listed, "..."] if len(listed) < len(others) else listed),
@@ -239,7 +237,7 @@ def command(
     set_variant(given.variant)
 
     from reslrb_cli.optimization.first_fit import has_candidates
-    from reslrb_cli.optimization.views import own_channels
+    from reslrb_cli.optimization.views import RESPONSE, own_channels
     from reslrb_cli.scene.images import photo_lines, read_stored
     from reslrb_cli.scene.load import load_scene
     from reslrb_cli.scene.needs import paths_obstacle
@@ -283,8 +281,8 @@ def command(
     if photo is not None and seconds > 0 and has_candidates(scene, proposals, is_integer and not is_raw):
         found = _try_out(photo, size, is_raw, proposals, write_config, seconds, has_camera)
     freed, explained = ([], {}) if found is None else (found.freed, found.explained)
-    proposals = _with_freed(proposals, freed)
-    text = write_config(path, target=image, proposals=proposals, explained=explained, freed=freed)
+    proposals, has_response = _with_freed(proposals, freed), RESPONSE in freed
+    text = write_config(path, target=image, proposals=proposals, explained=explained, has_response=has_response)
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written
@@ -314,6 +312,7 @@ def _try_out(
     """Fit the photograph. Return None after an error, which does not lose the configuration."""
     from reslrb_cli.optimization.first_fit import assemble_first_fit, try_out
     from reslrb_cli.optimization.uncertainty.measuring import Budget
+    from reslrb_cli.optimization.views import RESPONSE
     from reslrb_cli.scene.proposal import LEAST_SHARE, write_smaller
 
     began = time.perf_counter()
@@ -325,7 +324,8 @@ def _try_out(
             tinted = [each.info.key for each in proposals if tinted_by(each.key) and each.share >= LEAST_SHARE]
 
             def make(freed: Sequence[str]) -> Problem:
-                text = write_config(path, target=image, proposals=_with_freed(proposals, freed), freed=freed)
+                recovered, has_response = _with_freed(proposals, freed), RESPONSE in freed
+                text = write_config(path, target=image, proposals=recovered, has_response=has_response)
                 # Raises an error if an exposure makes up for all that is freed.
                 return assemble_first_fit(loads(text, path), size, has_camera, bool(freed), tinted)
 

@@ -144,7 +144,7 @@ def try_out(
 
 
 @dataclass(frozen=True)
-class _Look:
+class _FitTest:
     """Test of fit, and the effects of groups of parameters that noise hardly causes. An effect is twice the fall of
     the loss. `known` has measured the recovered directions.
     """
@@ -154,7 +154,7 @@ class _Look:
     effects: dict[str, float]
 
 
-def _look(problem: Problem, rough: Mapping[str, Proposal], go_on: Callable[[], bool]) -> _Look | None:
+def _look(problem: Problem, rough: Mapping[str, Proposal], go_on: Callable[[], bool]) -> _FitTest | None:
     """Test the roughnesses `rough`, and the response of the camera, at the values of `problem`. Return None if the time
     ends first.
     """
@@ -171,7 +171,7 @@ def _look(problem: Problem, rough: Mapping[str, Proposal], go_on: Callable[[], b
         effects = {name: min(2 * fall, fit.total) for name, (fall, p, _) in tests.items() if p <= CERTAIN}
         if effects:
             break
-    return _Look(fit, known, effects)
+    return _FitTest(fit, known, effects)
 
 
 def has_candidates(scene: mi.Scene, proposals: Sequence[Proposal], has_response: bool) -> bool:

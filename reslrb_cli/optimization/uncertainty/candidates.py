@@ -116,7 +116,7 @@ def _find_candidates(
 
 
 @dataclass(frozen=True)
-class Group:
+class TestedGroup:
     """Parameters that are tested together. `derivatives` (K, N) are those of the images along their directions, by each
     set of samples. `tests` returns the tests of these directions beside directions with other derivatives.
     """
@@ -133,7 +133,7 @@ class Group:
 
 def measure_together(
     problem: Problem, fit: Fit, known: LossCurvature, proposals: Mapping[str, Proposal], go_on: Callable[[], bool]
-) -> Group | None:
+) -> TestedGroup | None:
     """Return the group of all `proposals`, or None if the time ends first."""
     others = _recovering(problem, proposals)
     before = others.values()
@@ -142,12 +142,12 @@ def measure_together(
         directions, *_ = curvature.along(changes, go_on)
         if len(directions) < sum(len(change.directions) for change in changes):
             return None
-        return Group(curvature.derivatives, lambda known: _tests_of(fit, known, curvature, directions))
+        return TestedGroup(curvature.derivatives, lambda known: _tests_of(fit, known, curvature, directions))
     finally:
         others.selection.set_arrays(before)
 
 
-def group_response(problem: Problem, fit: Fit, known: LossCurvature) -> tuple[Group, Array] | None:
+def group_response(problem: Problem, fit: Fit, known: LossCurvature) -> tuple[TestedGroup, Array] | None:
     """Return the numbers of a response as a group, with their places (K,) in the curve. Return None if no curve could
     be recovered.
     """
@@ -158,7 +158,7 @@ def group_response(problem: Problem, fit: Fit, known: LossCurvature) -> tuple[Gr
     new = derivatives[0][places], derivatives[1][places]
     slope, variance = _slope_and_noise(fit, known)
     channels = np.full(len(places), max(each.shape[2] for each in fit.slopes))
-    return Group(new, lambda others: _Tests(others, new, known.weights, slope, variance, channels)), places
+    return TestedGroup(new, lambda others: _Tests(others, new, known.weights, slope, variance, channels)), places
 
 
 def _recovering(problem: Problem, proposals: Mapping[str, Proposal]) -> Problem:
