@@ -166,7 +166,9 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     # A mask excludes pixels that see mirrors and smooth glass, so only materials that other pixels show are proposed.
     shown = [info for info, share in found if share >= LEAST_SHARE and info.key not in smooth]
     # The scene knows a texture with a pattern, and noise would replace it.
-    shown = [info for info in shown if not is_pattern(params, info)]
+    patterns = {info.key for info, _ in found if is_pattern(params, info)}
+    shown = [info for info in shown if info.key not in patterns]
+    tinted = {key for key in patterns if COLOURS.search(key) and tint_obstacle(params, key) is None}
     seen = {info.key for info in shown if _is_foremost(params, info)}
     if lamps:
         seen |= {info.key for info, share in found if share >= LEAST_LAMP and _RADIANCE.search(info.key)}
@@ -176,14 +178,8 @@ def propose(scene: mi.Scene, sensor: int, lamps: bool = False) -> list[Proposal]
     return [
         Proposal(info, share, bounds_of(params, info, is_tint), None if is_tint else _resolution(info),
                  info.key in first, is_tint)
-        for info, share in found for is_tint in [has_tint(params, info)]
+        for info, share in found for is_tint in [info.key in tinted]
     ]  # fmt: skip
-
-
-def has_tint(params: mi.SceneParameters, info: ParameterInfo) -> bool:
-    """True if a texture of colours has a pattern that the scene knows, so that only its tint is recovered."""
-    is_colours = bool(COLOURS.search(info.key))
-    return is_colours and is_pattern(params, info) and tint_obstacle(params, info.key) is None
 
 
 def is_pattern(params: mi.SceneParameters, info: ParameterInfo) -> bool:

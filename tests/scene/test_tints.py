@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
+from cli import tiny
 from kit import area, diffuse, scene, sensor, shape
 
 import reslrb_cli as rl
@@ -195,6 +196,16 @@ def test_a_wrong_tint_is_named_and_can_be_freed(tmp_path: Path, llvm: str):
     assert spec.bounds[0] == 0
     assert 1 < spec.bounds[1] < 1.1  # the largest texel becomes 1
     assert assemble(with_freed(load(path), [TINT], "--free")).selection.keys == [WALL, TINT]
+
+
+def test_the_first_fit_of_init_frees_a_wrong_tint_and_no_right_one(tmp_path: Path, llvm: str):
+    write_run(tmp_path, {"key": WALL})
+    for name, is_wrong in (("wrong", True), ("right", False)):
+        if not is_wrong:
+            write(tmp_path, tint=TRUE)
+        file = tmp_path / f"{name}.yaml"
+        tiny.done("init", tmp_path / "scene.xml", "--target", tmp_path / "target.exr", "-o", file, "--fit", 300)
+        assert any(spec.tint == PATTERN for spec in load(file).parameters) is is_wrong
 
 
 def test_a_pattern_is_proposed_as_a_tint_and_a_flat_texture_by_its_texels(tmp_path: Path, llvm: str):
