@@ -59,11 +59,10 @@ def test_a_texture_of_one_channel_has_a_tint_of_one_number(make_scene):
     np.testing.assert_allclose(np.array(mi.traverse(made)["floor.alpha.data"]), 0.5 * weight, rtol=1e-6)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", pytest.param("llvm_ad_spectral", marks=pytest.mark.long)])
+@pytest.mark.parametrize("variant", ["llvm", "spectral"])
 def test_the_gradient_is_the_sum_over_the_texels(make_scene, variant: str, request: pytest.FixtureRequest):
-    """With equal seeds, in both modes."""
-    mi.set_variant(variant)
-    request.addfinalizer(lambda: mi.set_variant("llvm_ad_rgb"))
+    """With equal seeds, with colours and with their spectra. `variant` is a fixture."""
+    request.getfixturevalue(variant)
     by_key, pattern = {}, np.linspace(0.1, 0.9, 4 * 6 * 3).reshape(4, 6, 3)
     for spec in ({"key": KEY}, {"tint": KEY}):
         bitmap = {"type": "bitmap", "raw": not mi.is_spectral, "bitmap": mi.Bitmap(pattern.astype(np.float32))}
@@ -73,7 +72,7 @@ def test_the_gradient_is_the_sum_over_the_texels(make_scene, variant: str, reque
         by_key[selection.keys[0]] = case.gradient(integrator("reslrb", 3), 1, 64)
     expected = (by_key[KEY].reshape(4, 6, 3) * pattern).sum((0, 1))
     assert (expected != 0).all()
-    np.testing.assert_allclose(by_key[NAME], expected, rtol=1e-4 if variant == "llvm_ad_rgb" else 0.02)
+    np.testing.assert_allclose(by_key[NAME], expected, rtol=0.02 if mi.is_spectral else 1e-4)
 
 
 def test_tangents_reach_the_texels(make_scene):
