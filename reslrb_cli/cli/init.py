@@ -211,10 +211,10 @@ def command(
     """Write a commented configuration for the scene in the file SCENE, to use with `reslrb optimize`.
 
     The configuration recovers the colours of the materials that are largest in view, the roughness of rough
-    conductors and glass, and the brightness of visible lamps. Textures with a pattern keep it, and have a tint.
-    Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips the lamps. All other
-    recoverable parameters are listed as comments with bounds and current values. Remove the # of those that you
-    want. Shapes in view that can be moved are listed, too.
+    conductors and glass, and the brightness of visible lamps. Textures with a pattern are left out; their tints
+    are listed. Lamps are left out if the photograph has 8 or 16 bits, because such a photograph clips the lamps.
+    All other recoverable parameters are listed as comments with bounds and current values. Remove the # of those
+    that you want. Shapes in view that can be moved are listed, too.
 
     With --target, the command first fits the photograph with few samples. If the colours do not explain the
     photograph, the configuration also recovers what does: roughnesses, the camera's response, or both, or the tint
