@@ -83,21 +83,50 @@ def _view_mask(value: Any) -> Any:
 ViewMask = Annotated[Mask, BeforeValidator(_view_mask), WithJsonSchema({"type": "string"})]
 
 
-def _exposure(value: Any) -> Any:
+def _is_factor(value: Any) -> bool:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if (is_number and math.isfinite(value) and value > 0) or value in ("auto", "per_channel"):
+    return is_number and math.isfinite(value) and value > 0
+
+
+def _exposure(value: Any) -> Any:
+    if _is_factor(value) or value in ("auto", "per_channel"):
         return value
-    raise wrong("must be a positive number, `auto` or `per_channel`")
+    if isinstance(value, dict) and len(value) == 1:
+        [(word, start)] = value.items()
+        factors = start if isinstance(start, list) else [start]
+        if len(factors) == {"auto": 1, "per_channel": 3}.get(word) and all(map(_is_factor, factors)):
+            return value
+    raise wrong("must be a positive number, `auto`, `per_channel`, {auto: NUMBER} or {per_channel: [R, G, B]}")
 
 
-_EXPOSURE = [{"type": "number", "exclusiveMinimum": 0}, {"enum": ["auto", "per_channel"]}]
+_FACTOR = {"type": "number", "exclusiveMinimum": 0}
+_FACTORS = {"type": "array", "items": _FACTOR, "minItems": 3, "maxItems": 3}
+_EXPOSURE = [
+    _FACTOR,
+    {"enum": ["auto", "per_channel"]},
+    *(
+        {"type": "object", "patternProperties": {f"^{word}$": start}, "additionalProperties": False, "minProperties": 1}
+        for word, start in (("auto", _FACTOR), ("per_channel", _FACTORS))
+    ),
+]
 
-#: An exposure: a number, `auto` (one recovered factor), or `per_channel` (one recovered factor per channel).
+#: An exposure: a number, `auto` (one recovered factor), or `per_channel` (one recovered factor per channel). A mapping
+#: of one of these words gives the start.
 Exposure = Annotated[
-    float | Literal["auto", "per_channel"],
+    float | Literal["auto", "per_channel"] | dict[str, float | list[float]],
     BeforeValidator(_exposure),
     WithJsonSchema({"anyOf": _EXPOSURE}),
 ]
+
+
+def recovered_exposure(exposure: Any) -> tuple[str, list[float]]:
+    """Return how an `Exposure` is recovered, as `auto` or `per_channel`, and its start: one number, or three for
+    `per_channel`. The word is empty for a number.
+    """
+    if isinstance(exposure, dict):
+        [(word, start)] = exposure.items()
+        return word, start if isinstance(start, list) else [start]
+    return {"auto": ("auto", [1.0]), "per_channel": ("per_channel", [1.0] * 3)}.get(exposure, ("", [exposure]))
 
 
 def _illuminant(value: str) -> str:
@@ -181,8 +210,9 @@ class TargetConfig(Section):
     weights."""
     exposure: Exposure = 1.0
     """Factor of the image before it is compared: target = exposure * image. A number, `auto` (one factor, recovered
-    with the parameters), or `per_channel` (one recovered factor per channel, for the white balance). All views share
-    it, unless `views` gives a view its own."""
+    with the parameters), or `per_channel` (one recovered factor per channel, for the white balance). Recovered factors
+    start at 1, or at the numbers of `{auto: NUMBER}` or `{per_channel: [R, G, B]}`. All views share the exposure,
+    unless `views` gives a view its own."""
 
     @model_validator(mode="before")
     @classmethod
@@ -259,7 +289,7 @@ def check_responses(views: list[ViewSpec] | None, target: TargetConfig) -> None:
         if target.white_balance is not None:
             reason = "cannot be combined with a recovered response; use exposure: per_channel instead"
             raise located("target.white_balance", reason)
-        if response.recovered == "curve" and not isinstance(each.exposure or target.exposure, str):
+        if response.recovered == "curve" and not recovered_exposure(each.exposure or target.exposure)[0]:
             owner = "target" if each.response is None else place
             reason = "is recovered only up to a factor, and so needs a recovered exposure"
             raise located(f"{owner}.response.curve", f"{reason}; set {place}.exposure to auto")
@@ -269,7 +299,9 @@ def fixed(section: Fixable) -> Fixable:
     """Return `target`, or an entry of `views`, with an exposure of 1 and the first response in place of recovered
     ones.
     """
-    update: dict[str, Any] = {"exposure": 1.0} if isinstance(section.exposure, str) else {}
+    update: dict[str, Any] = (
+        {"exposure": 1.0} if section.exposure is not None and recovered_exposure(section.exposure)[0] else {}
+    )
     if section.response is not None and section.response.recovered:
         update["response"] = section.response.fixed()
     return section.model_copy(update=update)

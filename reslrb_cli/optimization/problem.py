@@ -15,6 +15,7 @@ import numpy as np
 
 from reslrb_cli.config.parameters import Thickness, TransformName
 from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import recovered_exposure
 from reslrb_cli.integrators.reslrb import LightTracer
 from reslrb_cli.integrators.step import OnSamples
 from reslrb_cli.optimization.loading import BETWEEN_SPP, render_in_passes
@@ -342,7 +343,9 @@ def make_optimizer(config: Config, selection: Selection) -> Optimizer:
     optimizer.displace(selection.deformation.extents)
     # Images with an exposure of their own would fix the colours. Steps of `sgd` are short where gradients are small, so
     # they do not cross the valley.
-    is_shared = config.target.exposure == "auto" and all(view.exposure is None for view in config.views or ())
+    is_shared = recovered_exposure(config.target.exposure)[0] == "auto" and all(
+        view.exposure is None for view in config.views or ()
+    )
     if is_shared and SHARED in selection.factors and config.optimizer.type != "sgd":
         optimizer.balance(SHARED, [key for key in selection.keys if COLOUR.search(key)])
     return optimizer

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from reslrb_cli.config.optimizers import Loss as LossConfig
 from reslrb_cli.config.parameters import Settings
 from reslrb_cli.config.response import Response
 from reslrb_cli.config.schema import Config
-from reslrb_cli.config.views import Mask, ViewSpec
+from reslrb_cli.config.views import Mask, ViewSpec, recovered_exposure
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.integrators.protocol import first_channels
 from reslrb_cli.optimization.loading import choose_sensors, find_sensor
@@ -48,10 +48,14 @@ SHARED, RESPONSE = "exposure", "response"
 
 @dataclass
 class Exposure:
-    """Exposure of one view: `fixed`, or the value of `key` in `values` if `key` is not empty."""
+    """Exposure of one view: `fixed`, or the value of `key` in `values` if `key` is not empty.
+
+    A recovered exposure begins with `start`, which has one number, or one for each colour channel.
+    """
 
     fixed: float = 1.0
     key: str = ""
+    start: Sequence[float] = (1.0,)
     values: Mapping[str, Any] = field(default_factory=dict)
 
     def now(self) -> mi.Float | mi.Color3f | float:
@@ -145,7 +149,6 @@ class View:
     - A `held_out` view is not trained on, and has its own loss.
     - `file` is the file of the target, or None if the target is rendered. `file_key` and `mask_key` are the places of
         file and mask in the configuration.
-    - `per_channel` is true if the exposure is recovered for each channel.
     - `decoded_by` is the response that decodes the file, or None for the usual encoding. `response` is the response
         that is recovered, or None.
     - `codes` are the user's losses.
@@ -161,7 +164,6 @@ class View:
     weights: mi.TensorXf | None = None
     exposure: Exposure = field(default_factory=Exposure)
     held_out: bool = False
-    per_channel: bool = False
     decoded_by: Response | None = None
     response: RecoveredResponse | None = None
     file: Path | None = None
@@ -335,7 +337,8 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
     for number, (spec, sensor) in enumerate(zip(specs, sensors, strict=True)):
         place, is_held, own = f"views[{number}]", sensor in held_out, spec.exposure is not None
         exposure = target.exposure if spec.exposure is None else spec.exposure
-        if is_held and own and isinstance(exposure, str):
+        word, start = recovered_exposure(exposure)
+        if is_held and own and word:
             reason = f"has sensor {sensor}, whose own exposure no image determines; give it a number, or one "
             raise ConfigError(config.source, "run.held_out", f"{reason}exposure to all views")
         response = target.response if spec.response is None else spec.response
@@ -356,8 +359,7 @@ def make_views(config: Config, scene: mi.Scene) -> list[View]:
                 sensor,
                 loss,
                 share=1.0 if is_held else spec.weight / total,
-                exposure=Exposure(key=key) if isinstance(exposure, str) else Exposure(exposure),
-                per_channel=exposure == "per_channel",
+                exposure=Exposure(key=key, start=start) if word else Exposure(start[0]),
                 decoded_by=None if response is None else response.fixed(),
                 response=RecoveredResponse(recovered, RESPONSE if spec.response is None else f"{RESPONSE}.{sensor}")
                 if recovered
@@ -414,10 +416,11 @@ def expose(views: list[View], scene: mi.Scene, selection: Selection) -> None:
         if not (key := view.exposure.key):
             continue
         view.exposure.values = selection.factors
-        if key not in selection.factors:  # recovered as a logarithm, starting at 1
-            each = view.per_channel and color_channels(scene.sensors()[view.sensor].film()) == 3
-            one = mi.Color3f(1) if each else mi.Float(1)
-            selection.add_factor(key, one + dr.opaque(mi.Float, 0), Settings(initial=1.0, transform="log"))
+        if key not in selection.factors:  # recovered as a logarithm
+            factors = list(view.exposure.start)
+            each = len(factors) == 3 and color_channels(scene.sensors()[view.sensor].film()) == 3
+            value = mi.Color3f(factors) if each else mi.Float(factors[0])
+            selection.add_factor(key, value + dr.opaque(mi.Float, 0), Settings(initial=factors[0], transform="log"))
 
 
 def response_costs(views: list[View]) -> dict[str, dict[str, Cost]]:

@@ -24,6 +24,7 @@ import numpy as np
 from reslrb_cli.config.loader import Override, changed, load, parse_override
 from reslrb_cli.config.parameters import RunValue
 from reslrb_cli.config.schema import Config
+from reslrb_cli.config.views import recovered_exposure
 from reslrb_cli.config.yaml_text import format_location
 from reslrb_cli.errors import ConfigError, MachineError, is_machine_fault, similar
 from reslrb_cli.records import metrics
@@ -83,7 +84,24 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     config = read_config(run, parsed)
     start = RunValue(run=Path(os.path.realpath(run)))  # `latest` may lead to another run later
     specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
-    return config.model_copy(update={"parameters": specs})
+    config = config.model_copy(update={"parameters": specs})
+    return config if any("exposure" in each.location for each in parsed) else _from_exposures(config, run)
+
+
+def _from_exposures(config: Config, run: Path) -> Config:
+    """Return the configuration with recovered exposures that start at the values of the run in the folder `run`."""
+    target, specs = config.target, list(config.views or ())
+    for number, view in enumerate(_manifest_of(run).get("views") or ()):
+        own = number < len(specs) and specs[number].exposure is not None
+        word, _ = recovered_exposure(specs[number].exposure if own else target.exposure)
+        if not word or not isinstance(view.get("exposure"), str):
+            continue
+        update = {"exposure": {word: read_value(run, view["exposure"]).tolist()}}
+        if own:
+            specs[number] = specs[number].model_copy(update=update)
+        else:
+            target = target.model_copy(update=update)
+    return config.model_copy(update={"target": target, "views": specs or config.views})
 
 
 def read_config(run: Path, overrides: Sequence[str | Override] = ()) -> Config:

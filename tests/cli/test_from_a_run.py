@@ -246,6 +246,9 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     run = tmp_path / "runs/tiny"
     factor = read_value(run, "exposure") if exposure == "per_channel" else np.float32(exposure)
     assert np.all(np.abs(factor - 1) > 0.01)
+    if exposure == "per_channel":  # what starts from the run's values also starts at its exposure
+        np.testing.assert_allclose(recovered(run, ()).target.exposure["per_channel"], factor, rtol=1e-6)
+        assert recovered(run, ["target.exposure=auto"]).target.exposure == "auto"
     words = " ".join(f"{value:.4g}" for value in np.ravel(factor))
     for suffix in (".exr", ".png"):
         result = reslrb("render", run, "--set", "run.spp=4", "-o", tmp_path / f"with{suffix}")

@@ -91,10 +91,22 @@ def test_settings_of_a_view_replace_common_ones(folder):
     assert again == problem.config
 
 
+def test_a_recovered_exposure_starts_at_the_given_numbers(folder):
+    views = "views=[{sensor: 0}, {sensor: 1, exposure: {per_channel: [0.5, 2, 3]}}]"
+    problem = make(folder, views, "target.exposure={auto: 0.25}")
+    found = {key: np.array(value).ravel() for key, value in problem.values().items()}
+    np.testing.assert_allclose(found["exposure"], [0.25])
+    np.testing.assert_allclose(found["exposure.1"], [0.5, 2, 3])
+    assert loads(dump(problem.config), str(folder / "tiny.yaml")) == problem.config
+    fixed = problem.config.with_exposures_fixed()
+    assert fixed.target.exposure == fixed.views[1].exposure == 1
+
+
 @pytest.mark.parametrize(
     ("sets", "is_shared"),
     [
         (["target.exposure=auto", "optimizer.type=adam"], True),
+        (["target.exposure={auto: 2}", "optimizer.type=adam"], True),
         (["target.exposure=auto", "optimizer.type=adam", "views=[{sensor: 0}, {sensor: 1}]"], True),
         (["target.exposure=auto", "optimizer.type=adam", "views=[{sensor: 0}, {sensor: 1, exposure: 1}]"], False),
         (["target.exposure=per_channel", "optimizer.type=adam"], False),
@@ -130,7 +142,23 @@ BAD = [
     ("target.exposure=[auto, 1]", "target.exposure", "is a list; give each view its own in `views`"),
     ("views=[{sensor: 0, mask: {kinds: [alpha]}}]", "views[0].mask", "must be `none` or the path of an image"),
     ("views=[{sensor: 0, mask: auto}]", "views[0].mask", "must be `none` or the path of an image"),
-    ("target.exposure=-1", "target.exposure", "must be a positive number, `auto` or `per_channel`"),
+    *(
+        (
+            f"target.exposure={wrong}",
+            "target.exposure",
+            "must be a positive number, `auto`, `per_channel`, {auto: NUMBER}",
+        )
+        for wrong in (
+            "-1",
+            "{auto: 0}",
+            "{auto: [1, 1, 1]}",
+            "{per_channel: 2}",
+            "{per_channel: [1, .inf, 1]}",
+            "{}",
+            "{auto: 1, per_channel: [1, 1, 1]}",
+            "{curve: 1}",
+        )
+    ),
     ("target.mask=3", "target.mask", "must be `auto`, `none`"),
     ("target.white_balance={scene: D64}", "target.white_balance.scene", "did you mean `D65` or"),
     ("target.white_balance={photograph: A}", "target.white_balance", "has no effect on a rendered target"),
