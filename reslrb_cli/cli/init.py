@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from reslrb_cli.scene.images import StoredImage
     from reslrb_cli.scene.proposal import Proposal
     from reslrb_cli.scene.xml.read import Description
+    from reslrb_cli.statistics import Array
 
 
 #: Pixels of a film with which a run takes minutes on two cores, with these samples and at most these iterations.
@@ -45,7 +46,7 @@ PIXELS = 2**14
 SPP, ITERATIONS = 16, 300
 
 #: Time of the first fit in seconds.
-FIT_SECONDS = 30.0
+FIT_SECONDS = 60.0
 
 #: Maximum number of parameters in comments; a scene can have thousands.
 _MOST_OTHERS = 60
@@ -71,6 +72,7 @@ def _first_config(
     proposals: Sequence[Proposal],
     movable: Sequence[tuple[str, float, str, str]],
     explained: Mapping[str, float] = MappingProxyType({}),
+    values: Mapping[str, Array] = MappingProxyType({}),
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
@@ -78,10 +80,10 @@ def _first_config(
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
     ids, shares, file names and free motions of the shapes in view that can be moved. `explained` has the shares of the
-    misfit that parameters explain (`first_fit.FirstFit`). `known` are other template values, and `has_response` is true
-    if the response of the camera is recovered.
+    misfit that parameters explain (`first_fit.FirstFit`). `values` has values at the start. `known` are other template
+    values, and `has_response` is true if the response of the camera is recovered.
     """
-    from reslrb_cli.optimization.views import RESPONSE
+    from reslrb_cli.optimization.views import RESPONSE, SHARED
 
     first = [proposal for proposal in proposals if proposal.first]
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
@@ -92,11 +94,12 @@ def _first_config(
         {
             "path": partial(_path, folder=path.absolute().parent),
             "comment": _comment,
-            "entry": _entry,
+            "entry": partial(_entry, values=values),
             "note": partial(_note, explained=explained),
         },
         **({"has_response": False} | known),
         file=path.name,
+        exposure="{auto: " + _numbers(values[SHARED]) + "}" if SHARED in values else "auto",
         share_of_response=round(100 * explained.get(RESPONSE, 0.0)),
         given=", ".join(f"{_word(name)}: {json.dumps(value)}" for name, value in options.items()),
         rest=", ".join([*listed, "..."] if len(listed) < len(others) else listed),
@@ -120,10 +123,17 @@ def _comment(text: str) -> list[str]:
     return wrap(printable(text), _COMMENT - len("  # "), break_long_words=False)
 
 
-def _entry(proposal: Proposal) -> str:
+def _numbers(value: Array) -> str:
+    """Return a number, or a list of one number for each channel, as YAML."""
+    numbers = [f"{number:.4g}" for number in value.ravel()]
+    return numbers[0] if len(numbers) == 1 else f"[{', '.join(numbers)}]"
+
+
+def _entry(proposal: Proposal, values: Mapping[str, Array] = MappingProxyType({})) -> str:
     """Return the entry of a parameter."""
     option, name = entry_of(proposal.key)
     parts = [f"{option}: {_text(name)}"]
+    parts += [f"initial: {_numbers(values[proposal.key])}"] if proposal.key in values else []
     parts += [f"bounds: {proposal.bounds}"] if proposal.bounds is not None else []
     parts += [f"resolution: {list(proposal.resolution)}"] if proposal.resolution is not None else []
     return "{" + ", ".join(parts) + "}"
@@ -280,9 +290,11 @@ def command(
     has_camera = paths_obstacle(scene, sensor, "camera") is None
     if photo is not None and seconds > 0 and has_candidates(scene, proposals, is_integer and not is_raw):
         found = _try_out(photo, size, is_raw, proposals, write_config, seconds, has_camera)
-    freed, explained = ([], {}) if found is None else (found.freed, found.explained)
+    freed, explained, values = ([], {}, {}) if found is None else (found.freed, found.explained, found.values)
     proposals, has_response = _with_freed(proposals, freed), RESPONSE in freed
-    text = write_config(path, target=image, proposals=proposals, explained=explained, has_response=has_response)
+    text = write_config(
+        path, target=image, proposals=proposals, explained=explained, values=values, has_response=has_response
+    )
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written

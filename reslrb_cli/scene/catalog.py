@@ -31,6 +31,8 @@ _SPECTRA = ("RegularSpectrum", "IrregularSpectrum", "BlackBodySpectrum")
 _MESH_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "vertex_count", "face_count", "faces")
 #: Colours of materials, in which a photograph usually differs most from a scene.
 COLOUR = re.compile(r"(reflectance|base_color|color\d|vertex_color)(\.(value|data|tint))?$")
+#: Roughness of a material.
+ROUGHNESS = re.compile(r"\b(alpha\w*|\w*roughness)(\.(value|data))?$")
 #: Uniform emission of lamps.
 EMISSION = re.compile(r"\b(radiance|irradiance|intensity)(\.values?)?$")
 #: Ranges at whose ends Mitsuba's derivative is not that of the image, by the class of the BSDF and the name of the

@@ -19,7 +19,7 @@ import yaml
 from reslrb_cli.config.parameters import ParameterSpec, entry_of, tint_of
 from reslrb_cli.lens.transport import resized
 from reslrb_cli.records.images import write_bitmap
-from reslrb_cli.scene.catalog import COLOUR, ParameterInfo, list_parameters, owner_of
+from reslrb_cli.scene.catalog import COLOUR, ROUGHNESS, ParameterInfo, list_parameters, owner_of
 from reslrb_cli.scene.deformation import list_movable, where_moved
 from reslrb_cli.scene.dispersion import COEFFICIENT
 from reslrb_cli.scene.graph import SceneGraph
@@ -85,8 +85,6 @@ def _means(image: Image, size: tuple[int, int]) -> Image:
 #: A rough surface without a diffuse lobe shows its material's colour; users do not choose its specular factor of 1 as a
 #: colour.
 _ROUGHNESS, _FACTOR = re.compile(r"\balpha(_u|_v)?\.value$"), re.compile(r"\bspecular_\w+\.value$")
-#: Roughness of a material.
-ROUGHNESS = re.compile(r"\b(alpha\w*|\w*roughness)(\.(value|data))?$")
 #: Parameter that a visible lamp shows directly.
 _RADIANCE = re.compile(r"\bradiance\.value$")
 

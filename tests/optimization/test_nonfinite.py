@@ -134,7 +134,7 @@ def render(llvm, tmp_path, monkeypatch):
 
 
 #: Functions that see the images of a curvature, first at the values and then along directions.
-SEEN = "_see_at see see_images"
+SEEN = "see_at see see_images"
 #: Functions that measure an image or a gradient in a run of each way, apart from those of the ways before.
 PLACES = {
     "auto": {

@@ -35,7 +35,7 @@ from reslrb_cli.optimization.uncertainty.curvature import (
 from reslrb_cli.optimization.uncertainty.fit import LEVEL, Candidate, Fit, FitRecord
 from reslrb_cli.optimization.uncertainty.posterior import positive, pseudo_inverse
 from reslrb_cli.optimization.views import RESPONSE
-from reslrb_cli.scene.catalog import open_domain
+from reslrb_cli.scene.catalog import ROUGHNESS, open_domain
 from reslrb_cli.scene.deformation import where_moved
 from reslrb_cli.scene.dispersion import bends_light
 from reslrb_cli.scene.parameters import select_parameters
@@ -45,8 +45,9 @@ from reslrb_cli.statistics import Array, rms, special
 
 logger = logging.getLogger(__name__)
 
-#: Step of the differences, as a share of a parameter's scale.
-STEP = 0.1
+#: Step of the differences, as a share of a parameter's scale, and the factor for roughnesses. A roughness moves paths,
+#: so the noise of a difference hardly depends on the step.
+STEP, LONGER = 0.1, 2.0
 #: Largest `p` of parameters that are named.
 LEVEL_OF_NAMED = 0.01
 #: Smallest explained share of a parameter that is named.
@@ -62,17 +63,24 @@ MOST_TESTED, MOST_RECORDED = 24, 5
 LINEAR_FILES = (".exr", ".hdr", ".pfm")
 
 
-def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]) -> FitRecord:
+def judge_fit(
+    problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool], multiple: int = MOST_MULTIPLE
+) -> FitRecord:
     """Return the record of a test of fit, with the parameters that would reduce a misfit significantly.
 
-    `known` has measured the recovered directions. The test of further parameters ends when `go_on` returns false.
+    `known` has measured the recovered directions. The test of further parameters ends when `go_on` returns false. Its
+    images have at most `multiple` times the samples of a step.
     """
     if fit.p > LEVEL:
         return FitRecord(fit.p, 0.0, 0.0, False, [])
     found: list[tuple[float, float, Candidate]] = []
-    for find in () if known.biases else (_find_candidates, _test_response):
+    tests = (
+        lambda: _find_candidates(problem, fit, known, go_on, multiple),
+        lambda: _test_response(problem, fit, known),
+    )
+    for test in () if known.biases else tests:
         try:
-            found += find(problem, fit, known, go_on)
+            found += test()
         except Exception as error:
             logger.warning(f"not all parameters were tested that would reduce the misfit: {describe(error)}")
     named = sorted((each for each in found if each[1] <= LEVEL_OF_NAMED), key=lambda each: -each[0])
@@ -84,7 +92,7 @@ def judge_fit(problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[
 
 
 def _find_candidates(
-    problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
+    problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool], multiple: int
 ) -> list[tuple[float, float, Candidate]]:
     """Return the further parameters, each after the fall of the loss and its `p`. Significant ones come first."""
     proposals = {each.key: each for each in _unrecovered(problem)}
@@ -92,7 +100,7 @@ def _find_candidates(
         return []
     others = _recovering(problem, proposals)
     before = others.values()
-    changes, most = changes_of(others, STEP), MOST_MULTIPLE * problem.config.run.spp
+    changes, most = changes_of(others), multiple * problem.config.run.spp
     found: list[tuple[float, float, Candidate]] = []
     try:
         count, round, spp = 0, 0, known.spp
@@ -138,7 +146,7 @@ def measure_together(
     others = _recovering(problem, proposals)
     before = others.values()
     try:
-        changes, curvature = changes_of(others, STEP), LossCurvature(others, known.spp, of_target=False)
+        changes, curvature = changes_of(others), LossCurvature(others, known.spp, of_target=False)
         directions, *_ = curvature.along(changes, go_on)
         if len(directions) < sum(len(change.directions) for change in changes):
             return None
@@ -168,9 +176,11 @@ def _recovering(problem: Problem, proposals: Mapping[str, Proposal]) -> Problem:
     return replace(problem, selection=selection, optimizer=make_optimizer(problem.config, selection), regularizers={})
 
 
-def changes_of(problem: Problem, share: float) -> list[ParameterChange]:
-    """Return the renderings for the directions of all parameters. Steps are `share` of a parameter's scale."""
-    return plan_changes(problem, {key: _scale_of(problem, key) for key in problem.selection.keys}, share)
+def changes_of(problem: Problem) -> list[ParameterChange]:
+    """Return the renderings for the directions of all parameters."""
+    keys = problem.selection.keys
+    scales = {key: _scale_of(problem, key) * (LONGER if ROUGHNESS.search(key) else 1.0) for key in keys}
+    return plan_changes(problem, scales, STEP)
 
 
 def _tests_of(
@@ -210,9 +220,7 @@ def _test(
     return sorted(found, key=lambda each: (each[1] > LEVEL_OF_NAMED, -each[0]))
 
 
-def _test_response(
-    problem: Problem, fit: Fit, known: LossCurvature, go_on: Callable[[], bool]
-) -> list[tuple[float, float, Candidate]]:
+def _test_response(problem: Problem, fit: Fit, known: LossCurvature) -> list[tuple[float, float, Candidate]]:
     """Return the response of the camera as `_find_candidates` returns parameters, if a curve could be recovered."""
     found = group_response(problem, fit, known)
     if found is None:

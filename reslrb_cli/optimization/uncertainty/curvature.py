@@ -232,7 +232,7 @@ class LossCurvature:
     def __init__(self, problem: Problem, spp: int, of_target: bool = True, round: int = 0) -> None:
         self.problem, self.spp, self.round = problem, spp, round
         self._values = problem.values()
-        self._base = self._see_at({})
+        self._base = self.see_at({})
         pairs = zip(problem.trained, *self._base, strict=True)
         self._weights = [second_derivative(view, 0.5 * (a + b)) for view, a, b in pairs]
         values = sum(weight.size for weight in self._weights)
@@ -319,7 +319,7 @@ class LossCurvature:
         """Render all views at the current values of the scene, with each set of samples."""
         return [see_images(self.problem, self.spp, -1 - 2 * self.round - half, PURPOSE) for half in (0, 1)]
 
-    def _see_at(self, values: Mapping[str, Array]) -> list[list[Array]]:
+    def see_at(self, values: Mapping[str, Array]) -> list[list[Array]]:
         """Return the images of `see` with other `values`. The recording of an image depends on which parameters have
         derivatives, so here none has.
         """
@@ -330,7 +330,7 @@ class LossCurvature:
 
     def _derivatives(self, change: ParameterChange) -> list[list[Array]]:
         """Return the derivative of each view's exposed image (H, W, C) along a change, for each set of samples."""
-        pairs = zip(self._see_at(change.values), self._base, strict=True)
+        pairs = zip(self.see_at(change.values), self._base, strict=True)
         return [
             [
                 view.blurred(finite(a - b)) / change.amount

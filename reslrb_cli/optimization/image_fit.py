@@ -1,0 +1,216 @@
+"""Fit of a few parameters to photographs by differences of images, without reverse steps.
+
+Gauss-Newton steps (Levenberg 1944) use derivatives J from differences of images. An image has two sets of samples, and
+each product has one factor of either set, so noise does not bias it:
+
+    L = 1/2 sum W r_a r_b,   g = 1/2 (J_a W r_b + J_b W r_a),   H = J_a W J_b
+    x <- x - (H + d diag H)^-1 g
+
+r is the residual, and W is d2L/dI2. All images of a fit have the same samples, so their losses are comparable. A step
+is kept if L falls by more than the standard error of its fall, so a few bright pixels cannot carry it. Otherwise, it is
+tried again with a larger d. Entries at a bound do not move outwards.
+
+J needs an image for each parameter, and a step needs one. So J is measured again only if steps fail. Until then, it
+follows the images of the steps (Broyden 1965): the part of a step's change that J does not explain is shared between
+the parameters by their effects.
+
+A roughness can have several local minima, because it moves light in the image. `scan_roughnesses` therefore renders
+several values of each one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from reslrb_cli.optimization.assemble import set_values
+from reslrb_cli.optimization.nonfinite import finite
+from reslrb_cli.optimization.problem import Problem
+from reslrb_cli.optimization.uncertainty.candidates import LEAST_EIGENVALUE, changes_of
+from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, raise_eigenvalues
+from reslrb_cli.optimization.uncertainty.posterior import pseudo_inverse
+from reslrb_cli.optimization.views import SHARED
+from reslrb_cli.scene.catalog import COLOUR
+from reslrb_cli.statistics import Array
+
+#: Maximum numbers of measurements of J, of steps with one measurement, and of lengths that are tried for each step.
+MOST_MEASURED, MOST_STEPS, MOST_TRIES = 4, 12, 5
+#: First d, and the factor by which it falls after a step and rises after a refused one.
+DAMPING, FACTOR = 1e-3, 10.0
+#: Relative decrease of the loss by the steps of one measurement, below which the fit ends.
+CONVERGED = 0.03
+#: Largest logarithm of a factor in one step.
+LONGEST = 0.7
+#: Values of a roughness that are tried, as shares of the distance between its bounds.
+TRIED = (0.08, 0.2, 0.4, 0.65, 0.9)
+
+
+class ImageFit:
+    """Derivatives and residuals of images at the values of `problem`, and steps from there.
+
+    `x` (M,) has the coordinates of the directions: the value of an entry, or the factor of a whole texture. `J` (M, N)
+    and `residuals` (N,) have one array for each set of samples. `is_complete` is false if `go_on` has ended the
+    measurement.
+    """
+
+    def __init__(self, problem: Problem, spp: int, go_on: Callable[[], bool]) -> None:
+        self.problem, changes = problem, changes_of(problem)
+        self.known = LossCurvature(problem, spp, of_target=False)
+        self.known.along(changes, go_on)
+        self.directions = self.known.directions
+        self.is_complete = len(self.directions) == sum(len(change.directions) for change in changes)
+        self.start = {key: np.array(value, dtype=np.float64) for key, value in problem.values().items()}
+        of = [(each.key, each.entry) for each in self.directions]
+        self.bounds = {key: problem.selection.specs[key].bounds or (-np.inf, np.inf) for key in self.start}
+        self.x = np.array([1.0 if entry is None else self.start[key].ravel()[entry] for key, entry in of])
+        limits = [(0.0, np.inf) if at is None else self.bounds[key] for key, at in of]
+        self.low, self.high = np.array(limits).reshape(-1, 2).T
+        self.J = self.known.derivatives
+        self.residuals = residuals_of(self.known, self.known.images)
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """Return the values at coordinates (M,)."""
+        values = {key: value.copy() for key, value in self.start.items()}
+        for each, at in zip(self.directions, x, strict=True):
+            if each.entry is None:
+                values[each.key][..., slice(None) if each.channel is None else each.channel] *= at
+            else:
+                values[each.key].reshape(-1)[each.entry] = at
+        return {key: np.asarray(np.clip(value, *self.bounds[key])) for key, value in values.items()}
+
+    def fall_to(self, residuals: tuple[Array, Array]) -> tuple[float, float]:
+        """Return the fall of the loss to other residuals, and its standard error."""
+        return fall_of(self.known.weights, self.residuals, residuals)
+
+    @property
+    def loss(self) -> float:
+        return 0.5 * float(np.sum(self.known.weights * self.residuals[0] * self.residuals[1]))
+
+    def step(self, damping: float) -> Array:
+        """Return the coordinates (M,) after a step. Positive parameters without an upper bound change by a factor."""
+        own, at, (a, b), (one, other) = self.directions, self.x, self.J, self.residuals
+        is_factor = np.array([each.entry is not None for each in own]) & (at > 0) & np.isinf(self.high)
+        unit, weighted = np.where(is_factor, at, 1.0), a * self.known.weights
+        g = 0.5 * unit * (weighted @ other + b @ (self.known.weights * one))
+        H = raise_eigenvalues(weighted, b, np.zeros((len(a), len(a))))[0] * np.outer(unit, unit)
+        H += damping * np.diag(np.diag(H))
+        free = np.diag(H) > 0
+        while True:
+            step = np.zeros(len(g))
+            step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+            outwards = free & ((at <= self.low) & (step < 0) | (at >= self.high) & (step > 0))
+            if not outwards.any():
+                break
+            free &= ~outwards
+        step[is_factor] = np.clip(step[is_factor], -LONGEST, LONGEST)
+        du = next((size for each, size in zip(own, step, strict=True) if each.key == SHARED), 0.0)
+        new = at + step
+        # The images hardly change if the exposure rises and all colours fall. A step is one of E and E c, as in
+        # `block.py`.
+        is_colour = np.array([bool(COLOUR.search(each.key)) for each in own])
+        new[is_colour] = ((1 + du) * at + step)[is_colour] * np.exp(-du)
+        new[is_factor] = at[is_factor] * np.exp(step[is_factor])
+        return np.asarray(np.clip(new, self.low, self.high))
+
+    def move(self, x: Array, residuals: tuple[Array, Array]) -> None:
+        """Move to coordinates (M,) with these residuals, and let J follow."""
+        change = x - self.x
+        effect = np.abs(np.einsum("mn,n,mn->m", self.J[0], self.known.weights, self.J[1])) * change
+        J = []
+        for own, before, after in zip(self.J, self.residuals, residuals, strict=True):
+            changes = own != 0  # not the channels on which a colour has no effect
+            total = (changes * (effect * change)[:, None]).sum(axis=0)
+            missing = after - before - change @ own
+            J.append(own + changes * effect[:, None] * (missing / np.where(total > 0, total, np.inf)))
+        self.x, self.residuals, self.J = x, residuals, (J[0], J[1])
+
+
+def residuals_of(known: LossCurvature, images: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
+    """Return the differences (N,) of two sets of images and the targets."""
+    trues = [view.kept(np.array(view.target, dtype=np.float64)) for view in known.problem.trained]
+    one, other = (known.in_a_row([finite(image - true) for image, true in zip(own, trues, strict=True)])
+                  for own in images)  # fmt: skip
+    return one, other
+
+
+def fall_of(weights: Array, before: tuple[Array, Array], after: tuple[Array, Array]) -> tuple[float, float]:
+    """Return the fall of the loss between two pairs of residuals (N,), and its standard error."""
+    falls = 0.5 * weights * (before[0] * before[1] - after[0] * after[1])
+    return float(falls.sum()), float(np.sqrt(np.square(falls).sum()))
+
+
+def fit_by_differences(problem: Problem, spp: int, go_on: Callable[[], bool]) -> tuple[Problem, bool]:
+    """Return the problem with values that fit its targets, and whether the fit has ended before the time. Images have
+    two sets of `spp` samples per pixel.
+    """
+    damping = DAMPING
+    for _ in range(MOST_MEASURED):
+        fit = ImageFit(problem, spp, go_on)
+        if not fit.is_complete:
+            return problem, False
+        first, start, tries = fit.loss, fit.residuals, 0
+        for _ in range(MOST_STEPS):
+            x = fit.step(damping)
+            residuals = residuals_of(fit.known, fit.known.see_at(fit.values(x)))
+            fall, error = fit.fall_to(residuals)
+            is_kept = fall > error
+            if is_kept:
+                fit.move(x, residuals)
+            damping, tries = (damping / FACTOR, 0) if is_kept else (damping * FACTOR, tries + 1)
+            if tries == MOST_TRIES or not go_on() or (is_kept and fall < CONVERGED * fit.loss):
+                break
+        problem, damping = set_values(problem, fit.values(fit.x)), DAMPING
+        fall, _ = fall_of(fit.known.weights, start, fit.residuals)
+        if fall <= CONVERGED * first or not go_on():
+            break
+    return problem, go_on()
+
+
+def scan_roughnesses(
+    problem: Problem, keys: Sequence[str], known: LossCurvature, go_on: Callable[[], bool]
+) -> dict[str, float]:
+    """Return the values of roughnesses that reduce the loss, out of `TRIED`. Others are left out.
+
+    The parameters whose derivatives `known` has measured at the values of `problem` would follow. Effects of several
+    roughnesses on the images are added. One roughness at a time changes, as long as the loss falls by more than the
+    standard error of its fall.
+    """
+    images = LossCurvature(problem, known.spp, of_target=False)
+    names: list[tuple[str, float]] = []
+    rows = [[residual] for residual in residuals_of(images, images.images)]
+    for key in keys:
+        low, high = problem.selection.specs[key].bounds or (0.0, 1.0)
+        for share in TRIED:
+            if not go_on():
+                return {}
+            value = low + share * (high - low)
+            seen = images.see_at({key: np.full_like(problem.selection.array(key), value)})
+            names.append((key, value))
+            for own, after, before in zip(rows, seen, images.images, strict=True):
+                own.append(images.in_a_row([finite(a - b) for a, b in zip(after, before, strict=True)]))
+    one, other = _beside(known, np.array(rows[0]), np.array(rows[1]))
+    chosen: dict[str, int] = {}
+    while True:
+        at = [one[[0, *chosen.values()]].sum(axis=0), other[[0, *chosen.values()]].sum(axis=0)]
+        falls = []
+        for place, (key, _) in enumerate(names, 1):
+            if chosen.get(key) != place:
+                out = chosen.get(key)
+                moved = [own[place] - (own[out] if out else 0.0) for own in (one, other)]
+                fall, error = fall_of(images.weights, (at[0], at[1]), (at[0] + moved[0], at[1] + moved[1]))
+                falls.append((fall, error, key, place))
+        fall, error, key, place = max(falls, default=(0.0, 0.0, "", 0))
+        if not fall > error:
+            return {key: names[place - 1][1] for key, place in chosen.items()}
+        chosen[key] = place
+
+
+def _beside(known: LossCurvature, one: Array, other: Array) -> tuple[Array, Array]:
+    """Return rows (K, N) of two sets of samples without the parts that the known directions can cause."""
+    (a, b), weights = known.derivatives, known.weights
+    if not len(a):
+        return one, other
+    H = (a * weights) @ b.T
+    inverse = pseudo_inverse(0.5 * (H + H.T), LEAST_EIGENVALUE)
+    return one - ((one * weights) @ b.T @ inverse) @ a, other - ((other * weights) @ a.T @ inverse) @ b
