@@ -93,7 +93,7 @@ def _exposure(value: Any) -> Any:
         return value
     if isinstance(value, dict) and len(value) == 1:
         [(word, start)] = value.items()
-        factors = start if isinstance(start, list) else [start]
+        factors = start if isinstance(start, list) and word == "per_channel" else [start]
         if len(factors) == {"auto": 1, "per_channel": 3}.get(word) and all(map(_is_factor, factors)):
             return value
     raise wrong("must be a positive number, `auto`, `per_channel`, {auto: NUMBER} or {per_channel: [R, G, B]}")

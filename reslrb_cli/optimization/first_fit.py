@@ -64,8 +64,8 @@ MORE = 4, 16
 class FirstFit:
     """Result of `try_out`. `freed` are the parameters to recover too. `explained` has the share of the misfit that each
     tested parameter explains on its own, for those that explain a part. `misfit` is the size of the misfit as a share
-    of the photograph, or 0 if the model explains the photograph. It is None if the time ended first. `values` are the
-    values of the second fit, if roughnesses are recovered and no response.
+    of the photograph, or 0 if the model explains the photograph. It is None if the time ended first. `values` are those
+    of the last fit. They are empty if a response or a lamp is recovered, which starts anew.
     """
 
     misfit: float | None
@@ -117,18 +117,20 @@ def try_out(
         # The images distinguish a lamp from the exposure only if there is another lamp.
         is_lamp = bool(EMISSION.search(best)) and len(problem.scene.emitters()) > 1
         more = [best] if is_lamp or tinted_by(best) else []
-        return FirstFit(record.misfit, more, explained, _small_values(problem))
+        return FirstFit(record.misfit, more, explained, {} if more and is_lamp else _small_values(problem))
     keys = {ROUGHNESSES: list(rough), RESPONSE: [RESPONSE]}
     freed, rest = keys[name], {} if name == ROUGHNESSES else rough
     # A response and roughnesses explain a part of each other's misfits, so the rest is tested after a second fit.
     problem = set_values(make(freed), problem.values())
     if not _leave_textures_out(problem):
         return FirstFit(record.misfit, freed, explained)
+    before = problem.values()
     if name == ROUGHNESSES:
-        found = scan_roughnesses(problem, list(rough), look.known, go_on)
-        problem = set_values(problem, found)
+        problem = set_values(problem, scan_roughnesses(problem, list(rough), look.known, go_on))
     problem, is_fitted = fit_by_differences(problem, spp, go_on)
-    if name == ROUGHNESSES and is_fitted:
+    if not is_fitted:  # the colours may not follow the roughnesses of the scan
+        problem = set_values(problem, before)
+    elif name == ROUGHNESSES:
         problem, is_fitted = fit_by_differences(problem, MORE[0] * spp, go_on)
     again = _look(problem, rest, go_on) if is_fitted else None
     if again is not None:

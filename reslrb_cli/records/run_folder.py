@@ -85,18 +85,31 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     start = RunValue(run=Path(os.path.realpath(run)))  # `latest` may lead to another run later
     specs = [spec.model_copy(update={"initial": start}) for spec in config.parameters]
     config = config.model_copy(update={"parameters": specs})
-    return config if any("exposure" in each.location for each in parsed) else _from_exposures(config, run)
+    given = any(each.location[:1] == ("views",) or each.location[:2] in _OF_EXPOSURES for each in parsed)
+    return config if given else _from_exposures(config, run)
+
+
+#: Settings with the exposure of all views.
+_OF_EXPOSURES = (("target",), ("target", "exposure"))
 
 
 def _from_exposures(config: Config, run: Path) -> Config:
-    """Return the configuration with recovered exposures that start at the values of the run in the folder `run`."""
+    """Return the configuration with recovered exposures that start at the values of the run in the folder `run`. They
+    start anew beside a recovered response, which does so too.
+    """
     target, specs = config.target, list(config.views or ())
+    responses = target.response, *(spec.response for spec in specs)
+    if any(response is not None and response.recovered for response in responses):
+        return config
     for number, view in enumerate(_manifest_of(run).get("views") or ()):
         own = number < len(specs) and specs[number].exposure is not None
-        word, _ = recovered_exposure(specs[number].exposure if own else target.exposure)
+        word, start = recovered_exposure(specs[number].exposure if own else target.exposure)
         if not word or not isinstance(view.get("exposure"), str):
             continue
-        update = {"exposure": {word: read_value(run, view["exposure"]).tolist()}}
+        found = np.ravel(read_value(run, view["exposure"])).astype(float)
+        if found.size not in (1, len(start)) or not np.all(np.isfinite(found) & (found > 0)):
+            continue  # an image of one channel has one factor
+        update = {"exposure": {word: np.broadcast_to(found, len(start)).tolist() if len(start) > 1 else found[0]}}
         if own:
             specs[number] = specs[number].model_copy(update=update)
         else:

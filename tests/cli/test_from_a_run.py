@@ -248,7 +248,8 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     assert np.all(np.abs(factor - 1) > 0.01)
     if exposure == "per_channel":  # what starts from the run's values also starts at its exposure
         np.testing.assert_allclose(recovered(run, ()).target.exposure["per_channel"], factor, rtol=1e-6)
-        assert recovered(run, ["target.exposure=auto"]).target.exposure == "auto"
+        for given in ("target.exposure=auto", "target={render: {spp: 4}, exposure: auto}"):
+            assert recovered(run, [given]).target.exposure == "auto"
     words = " ".join(f"{value:.4g}" for value in np.ravel(factor))
     for suffix in (".exr", ".png"):
         result = reslrb("render", run, "--set", "run.spp=4", "-o", tmp_path / f"with{suffix}")

@@ -202,9 +202,9 @@ def test_colours_of_rooms_from_blender_are_recovered(tmp_path: Path, name: str) 
 
 
 #: Exposures that end more than 3 % off. Pictures of 48x30 pixels hardly tell an exposure from colours and roughnesses.
-OFF = {"sofa": 0.1, "dark": 0.1, "bright": 0.1}
+OFF = {"sofa": 0.06, "dark": 0.06, "bright": 0.09}
 TEXTURE = pytest.mark.xfail(
-    reason="the first fit leaves out pixels that see the textured floor, and frees no roughness"
+    reason="the first fit leaves out pixels that see the textured floor; one of two runs ended 0.1 off"
 )
 
 
