@@ -71,20 +71,19 @@ def _first_config(
     sensor: int,
     proposals: Sequence[Proposal],
     movable: Sequence[tuple[str, float, str, str]],
-    explained: Mapping[str, float] = MappingProxyType({}),
-    values: Mapping[str, Array] = MappingProxyType({}),
+    found: FirstFit | None = None,
     **known: Any,
 ) -> str:
     """Return the YAML of a configuration that is written to `path`. The template is `first_config.yaml.j2`.
 
     `options` holds the scene file's variables that the user has set. `variables` holds all variables of the scene file,
     as text. `sensors` holds the ids of the sensors. `sensor` is the index of the sensor in use. `movable` has the
-    ids, shares, file names and free motions of the shapes in view that can be moved. `explained` has the shares of the
-    misfit that parameters explain (`first_fit.FirstFit`). `values` has values at the start. `known` are other template
-    values, and `has_response` is true if the response of the camera is recovered.
+    ids, shares, file names and free motions of the shapes in view that can be moved. `found` is the first fit. `known`
+    are other template values, and `has_response` is true if the response of the camera is recovered.
     """
     from reslrb_cli.optimization.views import RESPONSE, SHARED
 
+    explained, values = ({}, {}) if found is None else (found.explained, found.values)
     first = [proposal for proposal in proposals if proposal.first]
     others = [f"{_word(name)}: {_word(text)}" for name, text in variables.items() if name not in options]
     listed = [text for text in others if len(text) <= _LONGEST][:_MOST_VARIABLES]
@@ -290,11 +289,9 @@ def command(
     has_camera = paths_obstacle(scene, sensor, "camera") is None
     if photo is not None and seconds > 0 and has_candidates(scene, proposals, is_integer and not is_raw):
         found = _try_out(photo, size, is_raw, proposals, write_config, seconds, has_camera)
-    freed, explained, values = ([], {}, {}) if found is None else (found.freed, found.explained, found.values)
+    freed = [] if found is None else found.freed
     proposals, has_response = _with_freed(proposals, freed), RESPONSE in freed
-    text = write_config(
-        path, target=image, proposals=proposals, explained=explained, values=values, has_response=has_response
-    )
+    text = write_config(path, target=image, proposals=proposals, found=found, has_response=has_response)
     specs = loads(text, path).parameters
     scene = load_scene(scene_file, options, keys=[key for spec in specs for key in spec.keys])
     select_parameters(scene, specs, path)  # raises errors before anything is written
