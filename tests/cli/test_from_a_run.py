@@ -23,6 +23,7 @@ from reslrb_cli.config.parameters import ParameterSpec, RunValue
 from reslrb_cli.errors import ConfigError
 from reslrb_cli.optimization import loading
 from reslrb_cli.optimization.assemble import assemble_scene
+from reslrb_cli.records import run_folder
 from reslrb_cli.records.checkpoint import STATE_FILE, save_checkpoint
 from reslrb_cli.records.images import load_image, read_parameters
 from reslrb_cli.records.run_folder import read_value, recovered
@@ -270,6 +271,24 @@ def test_renderings_use_the_exposure_and_the_exported_scene_names_it(
     assert line in result.output.splitlines()
     assert line in (tmp_path / "exported/scene.xml").read_text()
     assert "exposure" not in reslrb("export", folder / "runs/tiny", "-o", tmp_path / "plain").output
+
+
+@pytest.mark.parametrize(
+    ("sets", "found", "start"),
+    [
+        (["target.exposure=per_channel"], 0.5, {"per_channel": [0.5] * 3}),  # an image of one channel
+        (["target.exposure=auto"], 0.5, {"auto": 0.5}),
+        (["target.exposure=auto"], np.nan, "auto"),
+        (["target={file: a.png, exposure: auto, response: {curve: auto}}"], 0.5, "auto"),  # both start anew
+    ],
+)
+def test_an_exposure_starts_from_a_run_if_it_can(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, sets: list[str], found: float, start: object
+) -> None:
+    config = load(folder / "tiny.yaml", sets)
+    monkeypatch.setattr(run_folder, "_manifest_of", lambda run: {"views": [{"sensor": 0, "exposure": "exposure"}]})
+    monkeypatch.setattr(run_folder, "read_value", lambda run, key: np.float32(found))
+    assert run_folder._from_exposures(config, folder).target.exposure == start
 
 
 def test_mitsuba_renders_the_export_like_the_run(folder: Path) -> None:

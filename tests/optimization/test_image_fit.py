@@ -93,6 +93,42 @@ def test_a_fall_that_few_pixels_carry_is_within_its_error() -> None:
     assert good >= 95
 
 
+def test_a_step_is_kept_only_if_the_loss_falls_by_more_than_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stub:
+        is_complete, residuals, known, fall = True, (np.ones(1), np.ones(1)), None, 3.0
+
+        def __init__(self, problem: float, *_: object) -> None:
+            self.x, self.loss = problem, 10.0
+            self.known = SimpleNamespace(see_at=lambda values: values, weights=np.ones(1))
+
+        def step(self, damping: float) -> float:
+            return self.x + damping
+
+        def values(self, x: float) -> float:
+            return x
+
+        def fall_to(self, residuals: object) -> tuple[float, float]:
+            return self.fall, 2.0
+
+        def move(self, x: float, residuals: object) -> None:
+            self.x = x
+
+    monkeypatch.setattr(image_fit, "ImageFit", Stub)
+    monkeypatch.setattr(image_fit, "residuals_of", lambda known, images: (np.ones(1), np.ones(1)))
+    monkeypatch.setattr(image_fit, "set_values", lambda problem, values: values)
+    assert image_fit.fit_by_differences(0.0, 1, lambda: True)[0] > 0
+    Stub.fall = 1.0
+    assert image_fit.fit_by_differences(0.0, 1, lambda: True) == (0.0, True)
+
+
+def test_a_texture_stays_within_its_bounds() -> None:
+    fit = made(np.random.default_rng(5), np.array([2.0]))
+    fit.directions = [ParameterDirection("a.reflectance.data", np.ones(1))]
+    fit.start, fit.bounds = {"a.reflectance.data": np.full((2, 2, 3), 0.6)}, {"a.reflectance.data": (0.0, 1.0)}
+    np.testing.assert_array_equal(fit.values(np.array([2.0]))["a.reflectance.data"], 1.0)
+    np.testing.assert_allclose(fit.values(np.array([0.5]))["a.reflectance.data"], 0.3)
+
+
 class Images:
     """Images of a row of pixels: a floor whose highlight depends on its roughness, times a brightness."""
 
@@ -100,7 +136,7 @@ class Images:
         self.truth, random = truth, np.random.default_rng(4)
         self.noise = [noise * random.normal(size=PIXELS) for _ in range(2)]
         self.at = np.linspace(-3, 3, PIXELS)
-        self.target = self.image(truth)
+        self.target = 0.95 * self.image(truth)
         self.weights, self.derivatives = np.full(PIXELS, 1.0 / PIXELS), (self.image(0.5)[None], self.image(0.5)[None])
         view = SimpleNamespace(target=self.target, kept=lambda image: image)
         selection = SimpleNamespace(
@@ -122,10 +158,33 @@ class Images:
 
 @pytest.mark.parametrize("truth", [0.12, 0.22, 0.41, 0.5, 0.9])
 def test_a_scan_finds_a_roughness_beside_a_brightness(truth: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From 0.5, the nearest of the tried values is found. A right roughness stays."""
+    """From 0.5, the nearest of the tried values is found. A right roughness stays. The picture is darker too."""
     images = Images(truth, 0.02)
     monkeypatch.setattr(image_fit, "LossCurvature", lambda *args, **kwargs: images)
     found = scan_roughnesses(images.problem, ["a.alpha"], images, lambda: True)
     tried = [0.02 + share * 0.98 for share in TRIED]
     assert found == ({} if truth == 0.5 else {"a.alpha": min(tried, key=lambda value: abs(np.log(value / truth)))})
     assert scan_roughnesses(images.problem, ["a.alpha"], images, lambda: False) == {}
+
+
+def test_a_scan_revises_a_value_when_another_roughness_follows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two highlights overlap. The best single value is not the best one beside that of the other roughness."""
+
+    class Two(Images):
+        def see_at(self, values: dict[str, Array]) -> list[list[Array]]:
+            at = {"a.alpha": 0.5, "b.alpha": 0.5} | {key: float(value[0]) for key, value in values.items()}
+            clean = self.image(at["a.alpha"]) + np.roll(self.image(at["b.alpha"]), 12)
+            return [[clean] for _ in self.noise]
+
+    tried = [0.02 + share * 0.98 for share in (TRIED[0], TRIED[1], TRIED[-1])]  # the others are close to 0.5
+    images = Two(0.5, 0.0)
+    images.problem.selection.specs["b.alpha"] = images.problem.selection.specs["a.alpha"]
+    images.derivatives = np.zeros((0, PIXELS)), np.zeros((0, PIXELS))
+    monkeypatch.setattr(image_fit, "LossCurvature", lambda *args, **kwargs: images)
+    for one in tried:
+        for other in tried:
+            images.problem.trained[0].target = images.see_at(
+                {"a.alpha": np.full(1, one), "b.alpha": np.full(1, other)}
+            )[0][0]
+            found = scan_roughnesses(images.problem, ["a.alpha", "b.alpha"], images, lambda: True)
+            assert found == {"a.alpha": one, "b.alpha": other}
