@@ -168,23 +168,32 @@ def test_a_scan_finds_a_roughness_beside_a_brightness(truth: float, monkeypatch:
 
 
 def test_a_scan_revises_a_value_when_another_roughness_follows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two highlights overlap. The best single value is not the best one beside that of the other roughness."""
+    """The best single value, a = TRIED[0], is not the best one beside b = TRIED[0]."""
+    effects = {("a", 0): (1.2, 1.2), ("b", 0): (0.0, 1.5), ("a", 1): (2.0, 0.0)}
+    tried = [0.02 + share * 0.98 for share in TRIED]
 
-    class Two(Images):
-        def see_at(self, values: dict[str, Array]) -> list[list[Array]]:
-            at = {"a.alpha": 0.5, "b.alpha": 0.5} | {key: float(value[0]) for key, value in values.items()}
-            clean = self.image(at["a.alpha"]) + np.roll(self.image(at["b.alpha"]), 12)
-            return [[clean] for _ in self.noise]
+    def see_at(values: dict[str, Array]) -> list[list[Array]]:
+        [(key, value)] = values.items()
+        effect = effects.get((key, tried.index(float(value[0]))), (0.0, 0.0))
+        return [[np.tile(effect, PIXELS // 2)] for _ in range(2)]
 
-    tried = [0.02 + share * 0.98 for share in (TRIED[0], TRIED[1], TRIED[-1])]  # the others are close to 0.5
-    images = Two(0.5, 0.0)
-    images.problem.selection.specs["b.alpha"] = images.problem.selection.specs["a.alpha"]
+    images = Images(0.5, 0.0)
+    images.see_at, images.images = see_at, [[np.zeros(PIXELS)] for _ in range(2)]
     images.derivatives = np.zeros((0, PIXELS)), np.zeros((0, PIXELS))
+    images.problem.trained[0].target = np.tile((2.0, 2.0), PIXELS // 2)
+    images.problem.selection.specs = dict.fromkeys("ab", images.problem.selection.specs["a.alpha"])
     monkeypatch.setattr(image_fit, "LossCurvature", lambda *args, **kwargs: images)
-    for one in tried:
-        for other in tried:
-            images.problem.trained[0].target = images.see_at(
-                {"a.alpha": np.full(1, one), "b.alpha": np.full(1, other)}
-            )[0][0]
-            found = scan_roughnesses(images.problem, ["a.alpha", "b.alpha"], images, lambda: True)
-            assert found == {"a.alpha": one, "b.alpha": other}
+    found = scan_roughnesses(images.problem, ["a", "b"], images, lambda: True)
+    assert found == {"a": tried[1], "b": tried[0]}
+
+
+def test_known_directions_follow_a_scan() -> None:
+    """What they can cause is not in the rows that remain."""
+    random = np.random.default_rng(6)
+    J, other = random.normal(size=(2, PIXELS)), random.normal(size=PIXELS)
+    known = SimpleNamespace(derivatives=(J, J), weights=np.full(PIXELS, 1.0 / PIXELS))
+    rows = np.array([3 * J[0] - J[1], other, other + 5 * J[1]])
+    for left in image_fit._beside(known, rows, rows):
+        np.testing.assert_allclose(left[0], 0, atol=1e-9)
+        np.testing.assert_allclose(left[2], left[1], atol=1e-9)
+        assert np.corrcoef(left[1], other)[0, 1] > 0.98
