@@ -200,7 +200,8 @@ def _type(value: dict[str, Any]) -> str:
             return "[" + ", ".join(_type(item) for item in value["prefixItems"]) + "]"
         return "list of " + _plural(_type(value["items"]))
     if "patternProperties" in value:
-        return " or ".join(f"{{{key.strip('^$')}: {_type(each)}}}" for key, each in value["patternProperties"].items())
+        pairs = value["patternProperties"].items()
+        return " or ".join(f"`{{{key.strip('^$')}: {_type(each)}}}`" for key, each in pairs)
     if kind == "object":
         return "mapping from text to " + _type(value["additionalProperties"])
     if kind == "string":

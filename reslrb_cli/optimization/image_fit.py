@@ -20,7 +20,7 @@ several values of each one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -28,7 +28,12 @@ from reslrb_cli.optimization.assemble import set_values
 from reslrb_cli.optimization.nonfinite import finite
 from reslrb_cli.optimization.problem import Problem
 from reslrb_cli.optimization.uncertainty.candidates import LEAST_EIGENVALUE, changes_of
-from reslrb_cli.optimization.uncertainty.curvature import LossCurvature, raise_eigenvalues
+from reslrb_cli.optimization.uncertainty.curvature import (
+    LossCurvature,
+    ParameterChange,
+    ParameterDirection,
+    raise_eigenvalues,
+)
 from reslrb_cli.optimization.uncertainty.posterior import pseudo_inverse
 from reslrb_cli.optimization.views import SHARED
 from reslrb_cli.scene.catalog import COLOUR
@@ -55,7 +60,7 @@ class ImageFit:
     """
 
     def __init__(self, problem: Problem, spp: int, go_on: Callable[[], bool]) -> None:
-        self.problem, changes = problem, changes_of(problem)
+        changes = changes_of(problem)
         self.known = LossCurvature(problem, spp, of_target=False)
         self.known.along(changes, go_on)
         self.directions = self.known.directions
@@ -78,10 +83,6 @@ class ImageFit:
             else:
                 values[each.key].reshape(-1)[each.entry] = at
         return {key: np.asarray(np.clip(value, *self.bounds[key])) for key, value in values.items()}
-
-    def fall_to(self, residuals: tuple[Array, Array]) -> tuple[float, float]:
-        """Return the fall of the loss to other residuals, and its standard error."""
-        return fall_of(self.known.weights, self.residuals, residuals)
 
     @property
     def loss(self) -> float:
@@ -144,23 +145,22 @@ def fit_by_differences(problem: Problem, spp: int, go_on: Callable[[], bool]) ->
     """Return the problem with values that fit its targets, and whether the fit has ended before the time. Images have
     two sets of `spp` samples per pixel.
     """
-    damping = DAMPING
     for _ in range(MOST_MEASURED):
         fit = ImageFit(problem, spp, go_on)
         if not fit.is_complete:
             return problem, False
-        first, start, tries = fit.loss, fit.residuals, 0
+        first, start, damping, tries = fit.loss, fit.residuals, DAMPING, 0
         for _ in range(MOST_STEPS):
             x = fit.step(damping)
             residuals = residuals_of(fit.known, fit.known.see_at(fit.values(x)))
-            fall, error = fit.fall_to(residuals)
+            fall, error = fall_of(fit.known.weights, fit.residuals, residuals)
             is_kept = fall > error
             if is_kept:
                 fit.move(x, residuals)
             damping, tries = (damping / FACTOR, 0) if is_kept else (damping * FACTOR, tries + 1)
             if tries == MOST_TRIES or not go_on() or (is_kept and fall < CONVERGED * fit.loss):
                 break
-        problem, damping = set_values(problem, fit.values(fit.x)), DAMPING
+        problem = set_values(problem, fit.values(fit.x))
         fall, _ = fall_of(fit.known.weights, start, fit.residuals)
         if fall <= CONVERGED * first or not go_on():
             break
@@ -176,33 +176,34 @@ def scan_roughnesses(
     roughnesses on the images are added. One roughness at a time changes, as long as the loss falls by more than the
     standard error of its fall.
     """
-    images = LossCurvature(problem, known.spp, of_target=False)
-    names: list[tuple[str, float]] = []
-    rows = [[residual] for residual in residuals_of(images, images.images)]
+    changes = []
     for key in keys:
-        low, high = problem.selection.specs[key].bounds or (0.0, 1.0)
+        array, (low, high) = problem.selection.array(key), problem.selection.specs[key].bounds or (0.0, 1.0)
+        direction = ParameterDirection(key, np.ones(array.size))
         for share in TRIED:
-            if not go_on():
-                return {}
-            value = low + share * (high - low)
-            seen = images.see_at({key: np.full_like(problem.selection.array(key), value)})
-            names.append((key, value))
-            for own, after, before in zip(rows, seen, images.images, strict=True):
-                own.append(images.in_a_row([finite(a - b) for a, b in zip(after, before, strict=True)]))
-    one, other = _beside(known, np.array(rows[0]), np.array(rows[1]))
+            changes.append(ParameterChange({key: np.full_like(array, low + share * (high - low))}, 1.0, [direction]))
+    images = LossCurvature(problem, known.spp, of_target=False)
+    images.along(changes, go_on)
+    if len(images.directions) < len(changes):
+        return {}
+    residuals = residuals_of(images, images.images)
+    rows = (np.vstack(pair) for pair in zip(residuals, images.derivatives, strict=True))
+    one, other = _beside(known, *rows)
+
+    def residuals_at(chosen: Mapping[str, int]) -> tuple[Array, Array]:
+        places = [0, *chosen.values()]
+        return one[places].sum(axis=0), other[places].sum(axis=0)
+
     chosen: dict[str, int] = {}
     while True:
-        at = [one[[0, *chosen.values()]].sum(axis=0), other[[0, *chosen.values()]].sum(axis=0)]
-        falls = []
-        for place, (key, _) in enumerate(names, 1):
-            if chosen.get(key) != place:
-                out = chosen.get(key)
-                moved = [own[place] - (own[out] if out else 0.0) for own in (one, other)]
-                fall, error = fall_of(images.weights, (at[0], at[1]), (at[0] + moved[0], at[1] + moved[1]))
-                falls.append((fall, error, key, place))
+        before, falls = residuals_at(chosen), []
+        for place, change in enumerate(changes, 1):
+            [key] = change.values
+            fall, error = fall_of(images.weights, before, residuals_at({**chosen, key: place}))
+            falls.append((fall, error, key, place))
         fall, error, key, place = max(falls, default=(0.0, 0.0, "", 0))
         if not fall > error:
-            return {key: names[place - 1][1] for key, place in chosen.items()}
+            return {key: float(changes[place - 1].values[key].ravel()[0]) for key, place in chosen.items()}
         chosen[key] = place
 
 

@@ -41,6 +41,9 @@ _SHOWN = 3
 #: Name of the link to the newest run folder.
 LATEST = "latest"
 
+#: Settings with the exposure of all views.
+_OF_EXPOSURES = (("target",), ("target", "exposure"))
+
 #: Fabrication data of the solid of a run.
 FABRICATION_FILE = "fabrication.json"
 
@@ -89,13 +92,9 @@ def recovered(run: Path, overrides: Sequence[str | Override]) -> Config:
     return config if given else _from_exposures(config, run)
 
 
-#: Settings with the exposure of all views.
-_OF_EXPOSURES = (("target",), ("target", "exposure"))
-
-
 def _from_exposures(config: Config, run: Path) -> Config:
-    """Return the configuration with recovered exposures that start at the values of the run in the folder `run`. They
-    start anew beside a recovered response, which does so too.
+    """Return the configuration with recovered exposures that start at the values of the run in the folder `run`. If a
+    response is recovered, they keep their own start, because the response starts anew too.
     """
     target, specs = config.target, list(config.views or ())
     responses = target.response, *(spec.response for spec in specs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from reslrb_cli.optimization import image_fit
 from reslrb_cli.optimization.image_fit import TRIED, ImageFit, fall_of, scan_roughnesses
-from reslrb_cli.optimization.uncertainty.curvature import ParameterDirection
+from reslrb_cli.optimization.uncertainty.curvature import ParameterChange, ParameterDirection
 
 Array = np.ndarray
 
@@ -107,14 +108,12 @@ def test_a_step_is_kept_only_if_the_loss_falls_by_more_than_its_error(monkeypatc
         def values(self, x: float) -> float:
             return x
 
-        def fall_to(self, residuals: object) -> tuple[float, float]:
-            return self.fall, 2.0
-
         def move(self, x: float, residuals: object) -> None:
             self.x = x
 
     monkeypatch.setattr(image_fit, "ImageFit", Stub)
     monkeypatch.setattr(image_fit, "residuals_of", lambda known, images: (np.ones(1), np.ones(1)))
+    monkeypatch.setattr(image_fit, "fall_of", lambda *_: (Stub.fall, 2.0))
     monkeypatch.setattr(image_fit, "set_values", lambda problem, values: values)
     assert image_fit.fit_by_differences(0.0, 1, lambda: True)[0] > 0
     Stub.fall = 1.0
@@ -137,13 +136,14 @@ class Images:
         self.noise = [noise * random.normal(size=PIXELS) for _ in range(2)]
         self.at = np.linspace(-3, 3, PIXELS)
         self.target = 0.95 * self.image(truth)
-        self.weights, self.derivatives = np.full(PIXELS, 1.0 / PIXELS), (self.image(0.5)[None], self.image(0.5)[None])
+        self.weights, self.directions = np.full(PIXELS, 1.0 / PIXELS), []
+        self.known = SimpleNamespace(derivatives=(self.image(0.5)[None],) * 2, weights=self.weights, spp=4)
         view = SimpleNamespace(target=self.target, kept=lambda image: image)
         selection = SimpleNamespace(
             specs={"a.alpha": SimpleNamespace(bounds=(0.02, 1.0))}, array=lambda key: np.zeros(1)
         )
         self.problem = SimpleNamespace(trained=[view], selection=selection)
-        self.spp, self.images = 4, self.see_at({"a.alpha": np.full(1, 0.5)})
+        self.images = self.see_at({"a.alpha": np.full(1, 0.5)})
 
     def image(self, alpha: float) -> Array:
         return 0.3 + np.exp(-0.5 * (self.at / alpha) ** 2) / alpha
@@ -151,6 +151,14 @@ class Images:
     def see_at(self, values: dict[str, Array]) -> list[list[Array]]:
         clean = self.image(float(values["a.alpha"][0]))
         return [[clean * (1 + noise)] for noise in self.noise]
+
+    def along(self, changes: list[ParameterChange], go_on: Callable[[], bool]) -> None:
+        seen = [(change, self.see_at(change.values)) for change in changes if go_on()]
+        self.directions = [direction for change, _ in seen for direction in change.directions]
+        self.derivatives = tuple(
+            np.array([(images[half][0] - self.images[half][0]) / change.amount for change, images in seen])
+            for half in (0, 1)
+        )
 
     def in_a_row(self, images: list[Array]) -> Array:
         return images[0]
@@ -161,10 +169,10 @@ def test_a_scan_finds_a_roughness_beside_a_brightness(truth: float, monkeypatch:
     """From 0.5, the nearest of the tried values is found. A right roughness stays. The picture is darker too."""
     images = Images(truth, 0.02)
     monkeypatch.setattr(image_fit, "LossCurvature", lambda *args, **kwargs: images)
-    found = scan_roughnesses(images.problem, ["a.alpha"], images, lambda: True)
+    found = scan_roughnesses(images.problem, ["a.alpha"], images.known, lambda: True)
     tried = [0.02 + share * 0.98 for share in TRIED]
     assert found == ({} if truth == 0.5 else {"a.alpha": min(tried, key=lambda value: abs(np.log(value / truth)))})
-    assert scan_roughnesses(images.problem, ["a.alpha"], images, lambda: False) == {}
+    assert scan_roughnesses(images.problem, ["a.alpha"], images.known, lambda: False) == {}
 
 
 def test_a_scan_revises_a_value_when_another_roughness_follows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,11 +187,11 @@ def test_a_scan_revises_a_value_when_another_roughness_follows(monkeypatch: pyte
 
     images = Images(0.5, 0.0)
     images.see_at, images.images = see_at, [[np.zeros(PIXELS)] for _ in range(2)]
-    images.derivatives = np.zeros((0, PIXELS)), np.zeros((0, PIXELS))
+    images.known.derivatives = np.zeros((0, PIXELS)), np.zeros((0, PIXELS))
     images.problem.trained[0].target = np.tile((2.0, 2.0), PIXELS // 2)
     images.problem.selection.specs = dict.fromkeys("ab", images.problem.selection.specs["a.alpha"])
     monkeypatch.setattr(image_fit, "LossCurvature", lambda *args, **kwargs: images)
-    found = scan_roughnesses(images.problem, ["a", "b"], images, lambda: True)
+    found = scan_roughnesses(images.problem, ["a", "b"], images.known, lambda: True)
     assert found == {"a": tried[1], "b": tried[0]}
 
 
