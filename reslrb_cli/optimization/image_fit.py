@@ -63,13 +63,12 @@ class ImageFit:
         changes = changes_of(problem)
         self.known = LossCurvature(problem, spp, of_target=False)
         self.known.along(changes, go_on)
-        self.directions = self.known.directions
+        self.directions = own = self.known.directions
         self.is_complete = len(self.directions) == sum(len(change.directions) for change in changes)
         self.start = {key: np.array(value, dtype=np.float64) for key, value in problem.values().items()}
-        of = [(each.key, each.entry) for each in self.directions]
         self.bounds = {key: problem.selection.specs[key].bounds or (-np.inf, np.inf) for key in self.start}
-        self.x = np.array([1.0 if entry is None else self.start[key].ravel()[entry] for key, entry in of])
-        limits = [(0.0, np.inf) if at is None else self.bounds[key] for key, at in of]
+        self.x = np.array([1.0 if each.entry is None else self.start[each.key].ravel()[each.entry] for each in own])
+        limits = [(0.0, np.inf) if each.entry is None else self.bounds[each.key] for each in own]
         self.low, self.high = np.array(limits).reshape(-1, 2).T
         self.J = self.known.derivatives
         self.residuals = residuals_of(self.known, self.known.images)
